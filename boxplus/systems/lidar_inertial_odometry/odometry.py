@@ -206,7 +206,7 @@ class LidarInertialOdometry(Snapshots):
         self._datum = MapDatum(self._x, known if self._gap is None else with_unknown_pose(known), SHARED_ERRORS)
         self._mounting = UnknownMounting(self._x, self.config)
         self._mounting_drift = None if self.config.extrinsic_estimation == "off" else MountingDrift(self._x)
-        self._unshown = UnshownMotion(found.unshown_axes, found.time_ns)
+        self._unshown = UnshownMotion(found.unshown_axes, found.time_ns, found.state.p_world_imu, found.doubted)
         self._weak_spell = WeakSpell(self.config.weak_threshold, None if len(found.unshown_axes) else found.time_ns)
         if found.kind == "static":
             self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)

@@ -4,7 +4,8 @@ In a smooth corridor neither LiDAR nor IMU tells rest from a constant speed. The
 nobody knows it is kept beside the filter, as a constant that it does not estimate (a consider state: Schmidt, 1966). As long as
 nothing faces the axis, scans are called weak along it, and the standard deviation of the position grows by that of the speed
 times the time. Once surfaces do face the axis they show the speed: either they fit a platform that started at rest, or the
-innovations contradict it (`consistency`).
+innovations contradict it (`consistency`). Where such surfaces seemed to show rest at the start already, while much of what the
+LiDAR saw changed, they are believed only after a way.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surface
 _SPEED_M_S = 10.0  # standard deviation: what carries a LiDAR does 30 m/s at most
 _SCANS_BETWEEN_LOOKS = 5
 _ONE_AXIS = 0.9  # cosine
+_DRIVEN_M = 10.0  # along the axis: a registration that rides along with what it sees shows no way at all
 _AXIS_RAD = 0.005  # how well the planes of a scan show the axis that they leave open
 
 
@@ -32,12 +34,23 @@ class UnshownMotion:
     Args:
         axes: (K, 3) unit axes in the world along which rest was not shown; none by default.
         time_ns: of the start.
+        p_world: (3,) where it began [m].
+        doubted: whether something spoke against rest: surfaces seemed to show it, and show nothing until they have shown that the
+            platform drives.
     """
 
-    def __init__(self, axes: NDArray[np.float64] | None = None, time_ns: int = 0) -> None:
+    def __init__(
+        self,
+        axes: NDArray[np.float64] | None = None,
+        time_ns: int = 0,
+        p_world: NDArray[np.float64] | None = None,
+        doubted: bool = False,
+    ) -> None:
         self._axes = np.zeros((0, 3)) if axes is None else axes.copy()
         self._since_ns = time_ns
         self._scans = 0
+        self._p_start = np.zeros(3) if p_world is None else p_world.copy()
+        self._least_way_m = _DRIVEN_M if doubted else 0.0
         self._shown_by = np.zeros((3, 3))  # information about the position, summed
 
     @property
@@ -76,6 +89,8 @@ class UnshownMotion:
         tree.insert(p_world, downsample=True)
 
         def shown(axis: NDArray[np.float64]) -> bool:
+            if abs(axis @ (p_world_imu - self._p_start)) < self._least_way_m:
+                return False
             return surfaces_across(tree, p_world, p_world_imu, axis, directions.ratio_along(axis))
 
         self._axes = np.array([axis for axis in self._axes if not shown(axis)]).reshape(-1, 3)

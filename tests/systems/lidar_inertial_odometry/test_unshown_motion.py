@@ -34,9 +34,9 @@ def surface(normal: int, seed: int = 0) -> np.ndarray:
     return points
 
 
-def looked_at(unshown: UnshownMotion, points: np.ndarray) -> None:
+def looked_at(unshown: UnshownMotion, points: np.ndarray, x: float = 0.0) -> None:
     for _ in range(5):
-        unshown.look(points, np.zeros(3), CELL_M, pose_directions(np.eye(6), np.eye(6), 1.0, 0.0))
+        unshown.look(points + x * AXIS, x * AXIS, CELL_M, pose_directions(np.eye(6), np.eye(6), 1.0, 0.0))
 
 
 @lru_cache(maxsize=1)
@@ -83,6 +83,15 @@ def test_a_surface_across_the_axis_shows_the_speed() -> None:
     looked_at(unshown, surface(0))
     assert len(unshown.axes) == 0
     np.testing.assert_array_equal(unshown.widened(covariance(), 9 * 10**9), covariance())
+
+
+def test_where_rest_was_doubted_only_a_way_along_the_axis_lets_surfaces_show_it() -> None:
+    unshown = UnshownMotion(AXIS[None], 0, np.zeros(3), doubted=True)
+    for x in (0.0, -9.0):
+        looked_at(unshown, surface(0), x)
+        assert len(unshown.axes) == 1
+    looked_at(unshown, surface(0), -11.0)
+    assert len(unshown.axes) == 0
 
 
 def test_the_axis_is_refined_by_what_the_scans_leave_open() -> None:

@@ -22,7 +22,7 @@ from boxplus._words import signed
 from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import ChangedPoints, changed_points
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
 from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import (
     ASIDE_M,
@@ -61,6 +61,7 @@ class CommonMotion:
         velocity: (3,) what most points have in common [m/s], along the first scan's axes.
         level: (3, 3) the projection onto the plane in which it lies.
         doubt: what speaks against it, a sentence; empty where nothing does.
+        may_rest: whether that speaks for rest, and not for another motion.
     """
 
     pairs: Sequence[ChangedPoints]
@@ -68,6 +69,7 @@ class CommonMotion:
     velocity: NDArray[np.float64]
     level: NDArray[np.float64]
     doubt: str = ""
+    may_rest: bool = False
 
     def twists(self, axis: NDArray[np.float64] | None = None) -> list[Twist]:
         """How the LiDAR moved to every scan (nothing to the first); along a unit axis (3,) where that is known better."""
@@ -104,20 +106,70 @@ def common_motion(scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.
     velocity, matched = max(candidates, key=lambda candidate: candidate[1])
     if not _slowest(voting) < np.linalg.norm(velocity) < FASTEST_M_S or not _believed(voting, velocity):
         return None
-    own = [(R.T @ velocity, R.T @ up_lidar) for R in R_first]
-    counts = [stay_and_go((scans[k], scans[k + 1]), turning, *own[k]) for k in _PAIRS]
-    stay, go = np.sum(counts, axis=0).tolist()
+    stay, go = _stay_and_go(scans, turning, R_first, np.broadcast_to(velocity, (len(_PAIRS), 3)), up_lidar)
     rests = stay > max(go, _FEWEST_STAYING) or shows_rest(scans, velocity / np.linalg.norm(velocity), up_lidar)
     if rests and go <= _MOST_GOING:
         return None
     doubt = _traffic(voting, velocity, up_lidar)
-    if rests or stay > max(_STAYING * go, _FEWEST_STAYING):
-        doubt = f"of what stands on the ground, {stay} points stay and {go} go by, as at {np.linalg.norm(velocity):.0f} m/s"
+    if rests or _stays(stay, go):
+        doubt = _staying(stay, go, float(np.linalg.norm(velocity)))
+    may_rest = bool(doubt)
     for other, also in candidates:
         if also > _ANOTHER * matched and float(np.linalg.norm(other - velocity)) * voting[0].seconds > _APART_M:
             doubt = doubt or f"what changes fits {signed(other, 1)} m/s (LiDAR axes) about as well as {signed(velocity, 1)} m/s"
     pairs = [first.get(k) or _pair(scans, k, turning, R_first[k]) for k in range(len(scans) - 1)]
-    return CommonMotion(pairs, R_first, velocity, level, doubt)
+    return CommonMotion(pairs, R_first, velocity, level, doubt, may_rest)
+
+
+def speaks_against(path: LidarPath, scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.float64], fixed: bool) -> str:
+    """What speaks against the motion of a path, as fast as one that is looked for, a sentence; empty where nothing does.
+
+    Registrations may follow what drives around a platform at rest: things that stand stay, and what changes is on its lanes.
+
+    Args:
+        path: unbroken, a pose for every scan.
+        scans, turning, up_lidar: as of `common_motion`.
+        fixed: whether the surroundings fix its poses: only what stands may speak against it then.
+    """
+    if len(scans) < FEWEST_SCANS:
+        return ""
+    R = turning(path.time_ns)
+    R_first = np.swapaxes(R[:1], 1, 2) @ R
+    apart = np.diff(path.p_path_lidar, axis=0) / np.diff(path.time_ns)[:, None] * 1e9
+    velocities = apart[list(_PAIRS)]
+    pairs = [_pair(scans, k, turning, R_first[k]) for k in _PAIRS]
+    if np.linalg.norm(velocities, axis=1).min() < _slowest(pairs):
+        return ""
+    stay, go = _stay_and_go(scans, turning, R_first, velocities, up_lidar)
+    if _stays(stay, go):
+        return _staying(stay, go, float(np.linalg.norm(velocities[0])))
+    return "" if fixed or _matched(pairs, velocities) < _FEWEST_MATCHED else _traffic(pairs, velocities, up_lidar)
+
+
+def _stay_and_go(
+    scans: Sequence[Scan],
+    turning: Turning,
+    R_first: NDArray[np.float64],
+    velocities: NDArray[np.float64],
+    up_lidar: NDArray[np.float64],
+) -> tuple[int, int]:
+    """How many points of what stands stay and go by, with a velocity for every pair that votes (n, 3), along the first axes."""
+    stay, go = np.sum(
+        [
+            stay_and_go((scans[k], scans[k + 1]), turning, R_first[k].T @ velocity, R_first[k].T @ up_lidar)
+            for k, velocity in zip(_PAIRS, velocities, strict=True)
+        ],
+        axis=0,
+    ).tolist()
+    return stay, go
+
+
+def _stays(stay: int, go: int) -> bool:
+    return stay > max(_STAYING * go, _FEWEST_STAYING)
+
+
+def _staying(stay: int, go: int, speed: float) -> str:
+    return f"of what stands on the ground, {stay} points stay and {go} go by, as at {speed:.0f} m/s"
 
 
 def _pair(scans: Sequence[Scan], k: int, turning: Turning, R: NDArray[np.float64]) -> ChangedPoints:
@@ -131,11 +183,15 @@ def _slowest(pairs: Sequence[ChangedPoints]) -> float:
 
 
 def _traffic(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64], up: NDArray[np.float64]) -> str:
-    """That what changes is where traffic beside a platform at rest would be, a sentence; empty where it is not."""
+    """That what changes is where traffic beside a platform at rest would be, a sentence; empty where it is not.
+
+    Args:
+        pairs: what changes.
+        velocity: (3,), or one a pair (n, 3), along the first scan's axes, as `up` (3,).
+    """
+    velocity, matched = velocity.reshape(-1, 3)[0], np.concatenate(_again(pairs, velocity))
     along = velocity / np.linalg.norm(velocity)
-    aside = np.cross(up, along)
-    matched = np.concatenate(_again(pairs, velocity))
-    across = matched @ aside
+    across = matched @ np.cross(up, along)
     far = np.abs(across) > ASIDE_M
     places = np.unique(np.round(np.stack([across, matched @ along])[:, far] / _PLACE_M), axis=1).shape[1]
     beyond = float(far.mean())

@@ -45,6 +45,9 @@ def stay_and_go(
     """
     (before, since_before), (after, since_after), seconds = both_scans(*scans, turning)
     standing = _standing(after, velocity / np.linalg.norm(velocity), up)
+    # The ring on the ground at the foot of a rail goes along with the platform.
+    near = tree_of(after).nearest(after[standing], NEIGHBOURS).points
+    standing[standing] = after[standing] @ up - (near @ up).min(axis=1) > _UPRIGHT_M
     after, since_after = after[standing], since_after[standing] + seconds
     stays = are_there(after, before)
     goes = are_there(after + since_after[:, None] * velocity, before + since_before[:, None] * velocity)

@@ -13,6 +13,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame, joined_imu
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
@@ -20,6 +21,9 @@ from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 _QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at rest where the LiDAR cannot tell
 _FEWEST_QUIET_SAMPLES, _QUIET_TURN = 11, 0.03  # rad/s on average, an axis: the bias of a gyroscope in order
 _PARTS, _STEADY_ACCEL = 5, 0.1  # m/s²: what vibration leaves of a mean over a fifth of a second
+_PATIENCE_S, _PATIENT_SCANS = 3.0, 30
+UPRIGHT = 0.9
+"""The cosine of an axis and the vertical from which on it is called upright."""
 WAITING = "; waiting for more data"
 """How a refusal ends that the next scans may lift."""
 
@@ -41,6 +45,8 @@ class Beginning:
         up = self.extrinsic.R_imu_lidar.T @ self.imu.accel.mean(axis=0)
         self.up_lidar: NDArray[np.float64] = up / max(float(np.linalg.norm(up)), 1e-9)
         self.duration_s = (self.scans[-1].end_ns - self.scans[0].start_ns) * 1e-9
+        # What is in doubt may become clear; where it has not by now, a start says so.
+        self.waited_long = self.duration_s >= _PATIENCE_S or len(self.scans) >= _PATIENT_SCANS
         self.accel_norm = float(np.linalg.norm(self.imu.accel.mean(axis=0)))
         self.gyro_std, self.accel_std = float(self.imu.gyro.std(axis=0).max()), float(self.imu.accel.std(axis=0).max())
         self.evidence = (
@@ -60,6 +66,11 @@ class Beginning:
 
     def not_moving(self, why: str) -> NotYet:
         return NotYet(f"not at rest ({self.evidence}), and {why}{WAITING}")
+
+
+def broken(path: LidarPath) -> bool:
+    """Whether scans of a path do not lie upon the ones before them."""
+    return bool(path.failed or path.segment[-1] != path.segment[0])
 
 
 def _shaken_only(imu: ImuSamples) -> bool:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -16,24 +15,26 @@ from boxplus.filtering.nav_state import T_V, NavState
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
-from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import changed_share
-from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import common_motion
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
-    least_known_axis,
     mean_velocity,
     one_speed,
     other_speed,
-    well_known,
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
-from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns, turned_by_gyroscope
-from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING, Beginning, NotYet
+from boxplus.systems.lidar_inertial_odometry.start.beginning import UPRIGHT, WAITING, Beginning, NotYet, broken
+from boxplus.systems.lidar_inertial_odometry.start.changes import (
+    Common,
+    doubt_of_motion,
+    following_changes,
+    held_path,
+    undecided,
+    weighed_rest,
+)
 from boxplus.systems.lidar_inertial_odometry.start.first_state import gyro_bias, moving_fit, moving_state, static_state
 
 _REST_ACCEL_NORM = (9.0, 10.6)  # m/s²
@@ -44,9 +45,6 @@ _MIN_MOVING_SCANS = 8
 _FIRST = 3  # intervals between scans, of which the velocity is taken that undistorts the first one
 _MUCH_SHORTER = 0.8
 _FEWEST_SAMPLES = 5
-_UPRIGHT = 0.9  # cosine
-_COMPARED = 3  # pairs of scans
-_CHANGING = 0.0025  # share of points that change, of a rosette at rest too; on drives 0.003 and more
 _LARGEST_BIAS = 0.12  # rad/s, of a gyroscope that works
 _CANCELLED = 0.3  # of the difference of two turns is left of their sum, where one is the other reversed: a tilt is not mirrored
 _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
@@ -67,6 +65,7 @@ class Start:
         text: one sentence with the evidence.
         warning: what could not be decided, a sentence; empty when all was.
         unshown_axes: (K, 3) unit axes in the world along which rest was taken for granted.
+        doubted: whether something speaks against that; where nothing does, nothing speaks for it either.
     """
 
     kind: Literal["static", "moving"]
@@ -77,6 +76,7 @@ class Start:
     text: str
     warning: str = ""
     unshown_axes: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    doubted: bool = False
 
 
 def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
@@ -108,76 +108,19 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
 def _start(seen: Beginning) -> Start:
     """The start that fits all that has been seen."""
     path = lidar_path(seen.scans, seen.registration, seen.guesses, unbroken=True)
-    motion = _common_motion(seen, path)
+    motion = following_changes(seen, path)
     if motion is not None and not motion.shown:
-        return _moving_start(seen, _held_path(seen, seen.guesses, motion.twists), motion)
+        return _moving_start(seen, held_path(seen, seen.guesses, motion.twists), motion)
     _check_path(seen, path)
     rest = judge_rest(path, seen.scans, seen.registration)
     seen.note(rest)
     _check_gyroscope(seen, path, rest)
-    if rest.at_rest:
-        rest = _with_standing_things(seen, path, rest, motion is not None)
-    if rest.at_rest and (rest.determined or seen.imu_is_quiet(rest)):
-        return _static_start(seen, rest)
+    if not rest.at_rest:
+        return _moving_start(seen, path, motion)
+    rest, doubt = weighed_rest(seen, path, rest, in_motion=motion is not None)
+    if rest.determined or seen.imu_is_quiet(rest):
+        return _static_start(seen, rest, doubt)
     return _moving_start(seen, path, motion)
-
-
-@dataclass(frozen=True, slots=True)
-class _Common:
-    """The motion that explains what changes from scan to scan: to every scan, and whether the path shows it too."""
-
-    twists: Sequence[Twist]
-    shown: bool
-
-
-def _common_motion(seen: Beginning, path: LidarPath) -> _Common | None:
-    """The motion that explains what changes from scan to scan, where the path alone does not show it well."""
-    found = not _broken(path) and len(path) == len(seen.scans)
-    if not seen.guesses or (found and well_known(path)):  # without a gyroscope changes by turning are not told apart
-        return None
-    motion = common_motion(seen.scans, seen.guesses[0], seen.up_lidar)
-    if motion is None:
-        return None
-    held = _held_path(seen, seen.guesses, motion.twists())
-    shown = found and one_speed(path, held)
-    if motion.doubt and shown:
-        return None
-    if motion.doubt:
-        raise NotYet(f"the surroundings do not show how fast the platform moves ({seen.evidence}): {motion.doubt}{WAITING}")
-    way = held.p_path_lidar[-1] - held.p_path_lidar[0]
-    return _Common(motion.twists(way / np.linalg.norm(way)), shown)
-
-
-def _with_standing_things(seen: Beginning, path: LidarPath, rest: Rest, in_motion: bool) -> Rest:
-    """Rest, by what stands on the ground too: open axes that it closes, or one where much changes and little stays."""
-    if not rest.determined:
-        return replace(rest, open_axes=np.array([axis for axis in rest.open_axes if not _stands(seen, axis)]).reshape(-1, 3))
-    if in_motion or len(path) < 2 or well_known(path) or not seen.guesses:
-        return rest
-    least = least_known_axis(path)
-    if not _is_level(seen, least):
-        return rest
-    pairs = pairwise(seen.scans[: _COMPARED + 1])
-    changing = np.mean([changed_share(first, second, seen.guesses[0]) for first, second in pairs])
-    in_doubt = changing > _CHANGING and not _stands(seen, least)
-    return replace(rest, open_axes=least[None]) if in_doubt else rest
-
-
-def _stands(seen: Beginning, axis: NDArray[np.float64]) -> bool:
-    """Whether what stands on the ground shows rest along an axis (3,) of the LiDAR, across the vertical."""
-    return _is_level(seen, axis) and shows_rest(seen.scans, axis, seen.up_lidar)
-
-
-def _is_level(seen: Beginning, axis: NDArray[np.float64]) -> bool:
-    return bool(abs(axis @ seen.up_lidar) < _UPRIGHT)
-
-
-def _held_path(seen: Beginning, guesses: Sequence[Turning], motion: Sequence[Twist]) -> LidarPath:
-    """The path that follows a motion along its way, and the scans across it."""
-    path = lidar_path(seen.scans, seen.registration, guesses, undistort=True, expected=motion, held=True, unbroken=True)
-    if _broken(path):
-        raise seen.not_moving("the first scans do not overlap enough for a moving start")
-    return path
 
 
 def _newest(frames: Sequence[Frame], seconds: float) -> Sequence[Frame]:
@@ -211,16 +154,12 @@ def _check_accelerometer(norm: float) -> None:
 
 def _check_path(seen: Beginning, path: LidarPath) -> None:
     """Whether the scans show how the LiDAR moved, unbroken, and the IMU was there."""
-    if _broken(path) or len(path) < min(len(seen.frames), 3):
+    if broken(path) or len(path) < min(len(seen.frames), 3):
         raise NotYet(f"the first scans do not overlap enough to see whether they move ({seen.evidence}){WAITING}")
     time_ns = seen.imu.time_ns
     within = int(np.count_nonzero((time_ns >= path.time_ns[0]) & (time_ns <= path.time_ns[-1])))
     if len(path) < 2 or within < _FEWEST_SAMPLES:
         raise NotYet(f"{len(path)} scans and {within} IMU samples between them are not enough for a start{WAITING}")
-
-
-def _broken(path: LidarPath) -> bool:
-    return bool(path.failed or path.segment[-1] != path.segment[0])
 
 
 def _check_gyroscope(seen: Beginning, path: LidarPath, rest: Rest) -> None:
@@ -248,7 +187,7 @@ def _check_gyroscope(seen: Beginning, path: LidarPath, rest: Rest) -> None:
     )
 
 
-def _static_start(seen: Beginning, rest: Rest) -> Start:
+def _static_start(seen: Beginning, rest: Rest, doubt: str) -> Start:
     low, high = _REST_ACCEL_NORM
     if not low <= seen.accel_norm <= high:
         raise NotYet(
@@ -264,12 +203,13 @@ def _static_start(seen: Beginning, rest: Rest) -> Start:
         covariance,
         seen.duration_s,
         f"at rest: {seen.evidence}",
-        _undecided(axes),
+        _undecided(axes, doubt),
         axes @ (state.R_world_imu @ R_imu_lidar).T,
+        bool(doubt),
     )
 
 
-def _moving_start(seen: Beginning, path: LidarPath, motion: _Common | None = None, follow: bool = False) -> Start:
+def _moving_start(seen: Beginning, path: LidarPath, motion: Common | None = None, follow: bool = False) -> Start:
     """The start of a platform in motion, on a path that follows `motion` where that and not the registrations show its speed."""
     if len(seen.frames) < _MIN_MOVING_SCANS:
         raise seen.not_moving(f"{len(seen.frames)} scans are not enough for a moving start")
@@ -279,10 +219,10 @@ def _moving_start(seen: Beginning, path: LidarPath, motion: _Common | None = Non
     guesses, first = gyro_guesses(steady, seen.extrinsic.R_imu_lidar), path
     if not follow:
         path = lidar_path(scans, seen.registration, guesses, undistort=True, velocity=mean_velocity(first, _FIRST), unbroken=True)
-        follow = motion is not None and (_broken(path) or not one_speed(path, first))
+        follow = motion is not None and (broken(path) or not one_speed(path, first))
     if motion is not None and follow:
-        path = _held_path(seen, guesses, motion.twists)
-    if _broken(path):
+        path = held_path(seen, guesses, motion.twists)
+    if broken(path):
         raise seen.not_moving("the first scans do not overlap enough for a moving start")
     drift = path_drift(path, scans, seen.registration, guesses[0]) if not follow else None
     if drift is not None:
@@ -310,6 +250,9 @@ def _moving_start(seen: Beginning, path: LidarPath, motion: _Common | None = Non
             f"well at {np.linalg.norm(other):.1f} m/s as at {speed:.1f} m/s"
         )
     misfit = f"batch over {len(scans)} scans fits to {fit.sigma * 100:.1f} cm"
+    doubt = doubt_of_motion(seen, path, guesses[0], speed) if not follow else ""
+    if doubt:
+        raise seen.not_moving(f"the surroundings do not show how fast the platform moves: {doubt}")
     text = f"moving at {speed:.2f} ± {sigma:.2f} m/s: {seen.evidence}; {misfit}"
     return Start("moving", scans[0].end_ns, state, covariance, seen.duration_s, text)
 
@@ -345,16 +288,16 @@ def _checked_speed(seen: Beginning, state: NavState, covariance: NDArray[np.floa
 
 def _unshown(rest: Rest, up_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
     """(K, 3) axes along which nothing shows rest, LiDAR frame; up and down, hardly anything begins at a constant speed."""
-    return rest.open_axes[np.abs(rest.open_axes @ up_lidar) < _UPRIGHT].reshape(-1, 3)
+    return rest.open_axes[np.abs(rest.open_axes @ up_lidar) < UPRIGHT].reshape(-1, 3)
 
 
-def _undecided(axes: NDArray[np.float64]) -> str:
-    """A sentence about the axes along which nothing shows rest."""
+def _undecided(axes: NDArray[np.float64], doubt: str) -> str:
+    """A sentence about the axes along which nothing shows rest, and what speaks against it."""
     if not len(axes):
         return ""
     return (
-        "the surroundings do not show whether the platform moves along "
-        f"{' and '.join(signed(axis, 2) for axis in axes)} (LiDAR axes): taken as at rest, because the IMU is quiet; "
+        f"{undecided(axes)}{f' – {doubt}' if doubt else ''}: taken as at rest, "
+        "because the IMU is quiet; "
         "at a constant speed it would be as quiet, so the position along it is called weak and its standard deviation grows by "
         "10 m/s until something shows the speed"
     )

@@ -46,7 +46,7 @@ def test_the_shift_that_is_missing_is_found() -> None:
 def test_only_a_drive_changes_what_a_lidar_sees(lidar: SpinningLidar | RosetteLidar) -> None:
     """A rosette looks elsewhere in every scan: at rest that is no change."""
     assert changed_share(*street(lidar, 0.0), unturned) < 0.0025
-    assert changed_share(*street(lidar, 15.0), unturned) > 0.005
+    assert changed_share(*street(lidar, 15.0), unturned) > 0.0025
 
 
 def test_what_is_alone_in_its_scan_is_no_change() -> None:

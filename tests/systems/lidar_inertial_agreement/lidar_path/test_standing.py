@@ -35,6 +35,18 @@ def test_what_stands_stays_at_rest_and_goes_by_in_motion(speed: float) -> None:
     assert (go > 60, go == 0) == (speed > 0.0, speed == 0.0)
 
 
+def test_the_ring_at_the_foot_of_a_rail_does_not_stand() -> None:
+    """It goes along with the platform, and the rail above it makes its neighbours upright."""
+    angle = np.arctan2(8.0, 6.0) + np.linspace(-0.06, 0.06, 40)
+    ring = np.column_stack([10.0 * np.cos(angle), 10.0 * np.sin(angle), np.full(40, -1.6)])
+    x = np.arange(5.7, 6.4, 0.1)
+    rail = np.concatenate([np.column_stack([x, np.full(len(x), 8.05), np.full(len(x), z)]) for z in (-1.2, -0.9)])
+    p = np.concatenate([ring, rail]).astype(np.float32)
+    scans = [Scan.from_arrays(p, np.full(len(p), k * 10**8)) for k in range(2)]
+    stay, go = stay_and_go((scans[0], scans[1]), lambda t: np.tile(np.eye(3), (len(t), 1, 1)), 12.0 * AHEAD, UP)
+    assert stay <= len(rail) and go == 0
+
+
 def drive(posts: NDArray[np.float64], speed: float, rate_hz: float = 10.0, count: int = 11) -> list[Scan]:
     seconds = 1.0 / rate_hz
     return [sweep(posts, np.array([seconds * speed * number, 0.0]), seconds * number) for number in range(count)]

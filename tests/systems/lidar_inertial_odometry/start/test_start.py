@@ -15,12 +15,13 @@ from boxplus.manifolds import so3
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
-from boxplus.simulation import Scenario, SpinningLidar, simulate
+from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, simulate
 from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import sites
+from boxplus.simulation.worlds.world import World, box
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start
-from tests.systems.lidar_inertial_odometry.small_drives import LIDAR, before_a_wall, config, frames, room_walk, turning_by
+from tests.systems.lidar_inertial_odometry.small_drives import LIDAR, before_a_wall, config, frames, room_walk, run, turning_by
 
 
 def _angle_deg(a: np.ndarray, b: np.ndarray) -> float:
@@ -76,7 +77,7 @@ def test_a_speed_that_the_surroundings_do_not_show_is_no_start(voxel: float) -> 
     simulation = simulate(Scenario("tube", sites.tunnel(400.0), drive, lidar), duration_s=1.6)
     refusal = find_start(frames(simulation.events()), config(simulation, scan_voxel=voxel, map_cell=max(voxel, 0.25)))
     assert isinstance(refusal, str)
-    assert "the surroundings do not show how fast the platform moves along (" in refusal
+    assert "the surroundings do not show whether the platform moves along (" in refusal
     named = np.array([float(value) for value in refusal.split("along (")[1].split(")")[0].split(",")])
     axis = simulation.T_imu_lidar[:3, :3].T @ simulation.ground_truth([simulation.start_ns]).R_world_imu[0].T[:, 0]
     assert abs(named @ axis) > 0.99
@@ -111,6 +112,57 @@ def test_on_a_highway_what_stands_tells_rest_from_motion(seed: int, speed: float
     assert not found.warning and not len(found.unshown_axes)
     if kind == "moving":
         assert abs(np.linalg.norm(found.state.v_world_imu) - speed) < 0.5
+
+
+def among_cyclists(seconds: float, shaken: float = 0.0) -> tuple[list[Frame], Simulation]:
+    """At rest in an open field, boxes of the size of cyclists that ride about, different ways."""
+    random = np.random.default_rng(8)
+    lidar = SpinningLidar(channels=16, azimuth_steps=600)
+    rest = trajectories.at_rest(seconds + 1.0, (0.0, 0.0, 1.8))
+    field = list(sites.open_field(3, 3).solids)
+    p, v = random.uniform(-15.0, 15.0, (30, 2)), random.uniform(-6.0, 6.0, (30, 2))
+    p[np.linalg.norm(p, axis=1) < 4.0] *= 3.0
+    scans, first = [], None
+    for k in range(round(10.0 * seconds) - 1):
+        cyclists = [box((x, y, 0.9), (0.5, 0.5, 1.8)) for x, y in p + 0.1 * k * v]
+        imu = ImuModel(accel_vibration=30.0 * shaken, gyro_vibration=shaken)
+        scene = Simulation(Scenario("cyclists", World([*field, *cyclists]), rest, lidar, imu, np.eye(4)), 3, seconds)
+        first = first or scene
+        scans.append(scene.scan(k))
+    assert first is not None
+    samples = [event for event in first.events() if isinstance(event, ImuSamples)]
+    return frames([*samples, *scans]), first
+
+
+@pytest.mark.slow
+def test_rest_among_much_that_changes_waits_and_is_then_said_to_be_in_doubt() -> None:
+    seen, simulation = among_cyclists(3.4)
+    refusal = find_start(seen[:12], config(simulation))
+    assert isinstance(refusal, str)
+    assert "whether the platform moves along (" in refusal and "changes from scan to scan, and nothing that stands" in refusal
+    found = find_start(seen, config(simulation))
+    assert isinstance(found, Start) and found.kind == "static"
+    assert found.doubted and len(found.unshown_axes) == 1
+    assert "changes from scan to scan" in found.warning and "taken as at rest" in found.warning
+
+
+@pytest.mark.slow
+def test_a_shaken_platform_among_much_that_changes_is_no_start() -> None:
+    """Neither at rest, for its IMU is not quiet, nor moving at next to nothing."""
+    seen, simulation = among_cyclists(3.4, shaken=0.3)
+    assert isinstance(find_start(seen, config(simulation)), str)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "speed"), [(302, 26.0), (310, 26.0), (328, 20.0)])
+def test_drives_on_highways_start_as_drives(seed: int, speed: float) -> None:
+    lidar = SpinningLidar(azimuth_steps=900)
+    drive = manoeuvres.constant_velocity(5.0, (-20.0, 0.5, 1.8), (speed, 0.0, 0.0), manoeuvres.level(0.4))
+    simulation = Simulation(Scenario("highway", sites.highway(500.0, seed=seed), drive, lidar, T_imu_lidar=np.eye(4)), seed, 2.0)
+    odometry = LidarInertialOdometry(config(simulation))
+    run(odometry, simulation.events())
+    assert odometry.start is not None and odometry.start.kind == "moving"
+    assert abs(np.linalg.norm(odometry.start.state.v_world_imu) - speed) < 0.5
 
 
 @pytest.mark.parametrize(("reach_m", "bias"), [(0.6, 0.0), (0.9, 0.0), (0.6, 0.015)])
