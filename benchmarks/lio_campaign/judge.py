@@ -78,7 +78,7 @@ _WEAK = re.compile(r"scans are weak|scans that were read have no pose")
 _NOT_SHOWN = re.compile(
     r"^the surroundings do not show whether the platform moves along|^by its own covariance the run knows its last"
 )
-_REFUSED_FOR_IT = re.compile(r"and the surroundings do not show how (fast )?the platform (moves|turns)")
+_REFUSED_FOR_IT = re.compile(r"the surroundings do not show (how (fast )?the platform (moves|turns)|whether the platform moves)")
 
 
 class Truth(Protocol):

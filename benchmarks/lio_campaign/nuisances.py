@@ -54,12 +54,14 @@ def draw_nuisances(scene: Scene, seed: int) -> tuple[Fault, str]:
     return nuisance, "+".join(names)
 
 
-def _changes(
+def changes(
     name: str,
     text: str,
     scan: Callable[[Scan], Scan | None] | None = None,
     imu: Callable[[ImuSamples], ImuSamples] | None = None,
 ) -> Fault:
+    """A change of every scan and every block of samples; None leaves one out."""
+
     def events(incoming: Iterable[Event]) -> Iterator[Event]:
         for event in incoming:
             if isinstance(event, Scan):
@@ -72,7 +74,7 @@ def _changes(
     return Fault(name, text, events)
 
 
-def _moved(scan: Scan, p_lidar: NDArray[np.floating], keep: NDArray[np.bool_] | None = None) -> Scan:
+def moved(scan: Scan, p_lidar: NDArray[np.floating], keep: NDArray[np.bool_] | None = None) -> Scan:
     """The scan with other points, and of these only some; the sweep's ends stay."""
     moved = replace(scan, p_lidar=p_lidar.astype(np.float32))
     return moved if keep is None else moved.where(keep)
@@ -93,9 +95,9 @@ def _dropouts(scene: Scene, random: Random) -> Fault:
         keep = chance.uniform(size=len(scan)) > lost
         wet = chance.uniform(size=len(scan)) < drops
         shorter = np.where(wet, chance.uniform(0.1, 1.0, len(scan)), 1.0)
-        return _moved(scan, scan.p_lidar * shorter[:, None], keep)
+        return moved(scan, scan.p_lidar * shorter[:, None], keep)
 
-    return _changes("dropouts", f"{100 * lost:.0f} % of the returns lost, {100 * drops:.1f} % rain", scan)
+    return changes("dropouts", f"{100 * lost:.0f} % of the returns lost, {100 * drops:.1f} % rain", scan)
 
 
 def _mixed_pixels(scene: Scene, random: Random) -> Fault:
@@ -113,9 +115,9 @@ def _mixed_pixels(scene: Scene, random: Random) -> Fault:
         chance = at(scan.start_ns)
         edge = near & (np.abs(other_range - ranges) > 0.3) & (chance.uniform(size=len(p)) < share)
         part = np.where(edge, chance.uniform(size=len(p)), 0.0)
-        return _moved(scan, p * ((ranges + part * (other_range - ranges)) / ranges)[:, None])
+        return moved(scan, p * ((ranges + part * (other_range - ranges)) / ranges)[:, None])
 
-    return _changes("mixed_pixels", f"{100 * share:.0f} % of the beams at edges mixed", scan)
+    return changes("mixed_pixels", f"{100 * share:.0f} % of the beams at edges mixed", scan)
 
 
 def _beams(scene: Scene, random: Random) -> Fault:
@@ -134,10 +136,10 @@ def _beams(scene: Scene, random: Random) -> Fault:
         elevation, longer = elevation + offset_rad[laser], ranges + offset_m[laser]
         azimuth = np.arctan2(p[:, 1], p[:, 0])
         across = longer * np.cos(elevation)
-        return _moved(scan, np.stack([across * np.cos(azimuth), across * np.sin(azimuth), longer * np.sin(elevation)], axis=1))
+        return moved(scan, np.stack([across * np.cos(azimuth), across * np.sin(azimuth), longer * np.sin(elevation)], axis=1))
 
     text = f"lasers off by {100 * offset_m.std():.1f} cm and {np.rad2deg(offset_rad.std()):.2f} deg"
-    return _changes("beams", text, scan)
+    return changes("beams", text, scan)
 
 
 def _people(scene: Scene, random: Random) -> Fault:
@@ -181,9 +183,9 @@ def _people(scene: Scene, random: Random) -> Fault:
             height = origin[:, 2] + hit * direction[:, 2] - feet
             meets = (inside > 0) & (hit > 0.3) & (hit < seen) & (height > 0) & (height < _PERSON_HEIGHT_M) & (c > 0)
             seen = np.where(meets, hit, seen)
-        return _moved(scan, p * (seen / ranges)[:, None])
+        return moved(scan, p * (seen / ranges)[:, None])
 
-    return _changes("people", f"{count} people at {speed:.1f} m/s", scan)
+    return changes("people", f"{count} people at {speed:.1f} m/s", scan)
 
 
 def _carrier(scene: Scene, random: Random) -> Fault:
@@ -199,9 +201,9 @@ def _carrier(scene: Scene, random: Random) -> Fault:
         towards = course if scene.channels > 1 else 0.08 * course  # a narrow view looks along +x
         hit = np.abs(np.angle(np.exp(1j * (azimuth - towards)))) < 0.5 * width
         nearer = distance + at(scan.start_ns).normal(0.0, 0.03, len(p))
-        return _moved(scan, np.where(hit[:, None], p / ranges[:, None] * nearer[:, None], p))
+        return moved(scan, np.where(hit[:, None], p / ranges[:, None] * nearer[:, None], p))
 
-    return _changes("carrier", f"{np.rad2deg(width):.0f} deg of the view covered at {distance:.1f} m", scan)
+    return changes("carrier", f"{np.rad2deg(width):.0f} deg of the view covered at {distance:.1f} m", scan)
 
 
 def _tails(scene: Scene, random: Random) -> Fault:
@@ -213,9 +215,9 @@ def _tails(scene: Scene, random: Random) -> Fault:
         ranges, chance = np.linalg.norm(p, axis=1), at(scan.start_ns)
         off = np.where(chance.uniform(size=len(p)) < share, chance.normal(0.0, 0.15, len(p)), 0.0)
         measured = np.rint((ranges + off) / step) * step
-        return _moved(scan, p * (measured / ranges)[:, None], measured > 0.3)
+        return moved(scan, p * (measured / ranges)[:, None], measured > 0.3)
 
-    return _changes("tails", f"{100 * share:.0f} % of the ranges off by 15 cm, steps of {1000 * step:.0f} mm", scan)
+    return changes("tails", f"{100 * share:.0f} % of the ranges off by 15 cm, steps of {1000 * step:.0f} mm", scan)
 
 
 def _jitter(scene: Scene, random: Random) -> Fault:
@@ -232,7 +234,7 @@ def _jitter(scene: Scene, random: Random) -> Fault:
         step = int(np.diff(samples.time_ns).min())
         return replace(samples, time_ns=np.sort(samples.time_ns + np.minimum(late, max(step - 1, 0))))
 
-    return _changes("jitter", f"scans {1000 * scan_s:.1f} ms late on average, samples {1000 * imu_s:.1f} ms", scan, imu)
+    return changes("jitter", f"scans {1000 * scan_s:.1f} ms late on average, samples {1000 * imu_s:.1f} ms", scan, imu)
 
 
 def _losses(scene: Scene, random: Random) -> Fault:
@@ -247,7 +249,7 @@ def _losses(scene: Scene, random: Random) -> Fault:
         gone = chance.uniform(size=_PACKETS_PER_SCAN) < packets_lost
         span = max(scan.end_ns - scan.start_ns, 1)
         packet = np.clip((scan.time_ns - scan.start_ns) * _PACKETS_PER_SCAN // span, 0, _PACKETS_PER_SCAN - 1)
-        return _moved(scan, scan.p_lidar, ~gone[packet])
+        return moved(scan, scan.p_lidar, ~gone[packet])
 
     def imu(samples: ImuSamples) -> ImuSamples:
         keep = at(int(samples.time_ns[0])).uniform(size=len(samples)) > samples_lost
@@ -255,7 +257,7 @@ def _losses(scene: Scene, random: Random) -> Fault:
 
     percent = [f"{100.0 * share:.1f} %" for share in (samples_lost, packets_lost, scans_lost)]
     text = "of the samples {}, of the packets {}, of the scans {} lost".format(*percent)
-    return _changes("losses", text, scan, imu)
+    return changes("losses", text, scan, imu)
 
 
 def _imu_errors(scene: Scene, random: Random) -> Fault:
@@ -269,7 +271,7 @@ def _imu_errors(scene: Scene, random: Random) -> Fault:
         accel = np.rint(samples.accel @ accel_axes.T / accel_step) * accel_step
         return ImuSamples(samples.time_ns + round(delay_s * 1e9), gyro, accel)
 
-    return _changes(
+    return changes(
         "imu_errors",
         f"IMU not calibrated, steps of {gyro_step:g} rad/s and {accel_step:g} m/s², {1000 * delay_s:.0f} ms late",
         imu=imu,

@@ -26,12 +26,13 @@ from boxplus.runs.lidar_inertial.config import MapConfig, RunConfig
 from boxplus.runs.lidar_inertial.extrinsic import choose_extrinsic
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
-from boxplus.simulation import Simulation, as_recording, write_recording
+from boxplus.simulation import Fault, Simulation, as_recording, write_recording
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from lio_campaign.draws import Draw, draw
 from lio_campaign.judge import Drawn, Errors, Outcome, Truth, errors_of, judge
 from lio_campaign.nuisances import Scene, draw_nuisances
 from lio_campaign.real import RealDraw, draw_real, opened_real
+from lio_campaign.traffic import traffic
 
 _AnyDraw = TypeVar("_AnyDraw", Draw, RealDraw)
 
@@ -54,10 +55,13 @@ def run_seed(seed: int, *, command_line: bool = False, rough: bool = False, fast
     clock = _Clock()
     made = draw(seed, fast=fast)
     simulation = made.truth()
+    lidar = simulation.scenario.lidar
+    elevation = getattr(lidar, "vertical_fov_deg", (0.0, 0.0))
+    scene = Scene(simulation, simulation.T_imu_lidar, getattr(lidar, "channels", 1), elevation)
     if rough:
-        lidar = simulation.scenario.lidar
-        elevation = getattr(lidar, "vertical_fov_deg", (0.0, 0.0))
-        made = _roughened(made, Scene(simulation, simulation.T_imu_lidar, getattr(lidar, "channels", 1), elevation))
+        made = _roughened(made, *draw_nuisances(scene, seed))
+    if fast and seed % 4 >= 2:  # on every other pair of roads, so that tuned and untouched seeds have both
+        made = _roughened(made, traffic(scene, seed), "traffic")
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         if command_line:
@@ -86,17 +90,18 @@ def run_real(seed: int, shared: Path, *, rough: bool = False) -> dict[str, Any]:
         work = Path(folder)
         made = draw_real(seed, shared, work)
         if rough:
-            made = _roughened(made, Scene(made.truth(), made.T_true, made.channels, made.elevation_deg))
+            scene = Scene(made.truth(), made.T_true, made.channels, made.elevation_deg)
+            made = _roughened(made, *draw_nuisances(scene, seed))
         outcome = _in_process(lambda options: opened_real(made, options), made, work)
         truth = made.truth()
     facts = {"seed": seed, "real": True, **asdict(made.kinds), "detail": made.detail, "duration_s": round(made.duration_s, 2)}
     return facts | _judged(made, outcome, truth, []) | clock.read()
 
 
-def _roughened(made: _AnyDraw, scene: Scene) -> _AnyDraw:
-    """The draw with nuisances laid upon it before its fault."""
-    nuisance, names = draw_nuisances(scene, made.seed)
+def _roughened(made: _AnyDraw, nuisance: Fault, names: str) -> _AnyDraw:
+    """The draw with a nuisance laid upon it before its fault."""
     detail = f"{made.detail}; {nuisance.description}".lstrip("; ")
+    names = names if made.kinds.nuisance == "none" else f"{made.kinds.nuisance}+{names}"
     return replace(made, spoiled=nuisance.then(made.spoiled), kinds=replace(made.kinds, nuisance=names), detail=detail)
 
 

@@ -1,0 +1,81 @@
+"""Other vehicles on a road: beside the platform, ahead and behind, with it and against it, some of them at its own speed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.sensors.scan import Scan
+from boxplus.simulation import Fault
+from lio_campaign.nuisances import Scene, changes, moved
+
+_LANE_M = 3.6
+_LONG_M, _TRUCK_M, _WIDTH_M = 4.0, 16.0, 2.4
+_ROAD_BELOW_M = 1.9  # the IMU is at most this high
+_NEAREST_M = 3.0  # behind the one ahead, in the own lane
+_OWN_PACE = 0.2  # share of roads on which those that go the same way keep the platform's pace
+_AT_REST_M_S = 14.0
+
+
+def traffic(scene: Scene, seed: int) -> Fault:
+    """Traffic on lanes along x, for the whole recording.
+
+    Args:
+        scene: on a road along x.
+        seed: of the recording; its other draws do not depend on this one.
+    """
+    random = np.random.Generator(np.random.PCG64([seed, 5]))
+    truth, T = scene.truth, scene.T_imu_lidar
+    span_s = (truth.end_ns - truth.start_ns) * 1e-9
+    ends = truth.ground_truth(np.array([truth.start_ns, truth.end_ns], np.int64))
+    way = float(ends.p_world_imu[1, 0] - ends.p_world_imu[0, 0])
+    forwards, own = (1.0 if way >= 0.0 else -1.0), abs(way) / span_s
+    fleet = _AT_REST_M_S if own < 1.0 else own * (1.0 if random.uniform() < _OWN_PACE else float(random.uniform(0.75, 1.25)))
+    count = int(random.integers(4, 25))
+    lane = random.choice((-2, -1, 0, 1, 2), count, p=(0.2, 0.3, 0.1, 0.3, 0.1))
+    against = lane > 0
+    scatter = random.uniform(0.0, 0.06)
+    speed = fleet * random.uniform(1.0 - scatter, 1.0 + scatter, count) * np.where(against, -1.0, 1.0)
+    speed[lane == 0] = own  # in the own lane nobody is run over
+    length = random.uniform(_LONG_M, _TRUCK_M, count)
+    height = np.where(length > 8.0, 3.9, 1.6)
+    x = ends.p_world_imu[0, 0] + random.uniform(-90.0, 90.0, count)
+    clear = 0.5 * length + _NEAREST_M
+    offset = x - ends.p_world_imu[0, 0]
+    x = np.where((lane == 0) & (np.abs(offset) < clear), ends.p_world_imu[0, 0] + np.copysign(clear + 5.0, offset), x)
+    y = ends.p_world_imu[0, 1] + forwards * _LANE_M * lane
+    z = float(ends.p_world_imu[0, 2]) - _ROAD_BELOW_M
+    low = np.stack([-0.5 * length, np.full(count, -0.5 * _WIDTH_M), np.zeros(count)], axis=1)
+    high = np.stack([0.5 * length, np.full(count, 0.5 * _WIDTH_M), height], axis=1)
+
+    def scan(scan: Scan) -> Scan:
+        if not len(scan):
+            return scan
+        motion = truth.ground_truth(np.clip(scan.time_ns, truth.start_ns, truth.end_ns))
+        p = scan.p_lidar.astype(np.float64)
+        ranges = np.linalg.norm(p, axis=1)
+        direction = np.einsum("nij,nj->ni", motion.R_world_imu @ T[:3, :3], p / ranges[:, None])
+        origin = motion.R_world_imu @ T[:3, 3] + motion.p_world_imu
+        seconds = (scan.time_ns - truth.start_ns) * 1e-9
+        own_x = motion.p_world_imu[:, 0] - ends.p_world_imu[0, 0]
+        seen = ranges.copy()
+        for k in range(count):
+            # In the own lane a vehicle keeps its distance, whatever the platform does.
+            travelled = own_x if lane[k] == 0 else forwards * speed[k] * seconds
+            middle = np.stack([x[k] + travelled, np.full(len(p), y[k]), np.full(len(p), z)], axis=1)
+            hit = _entered(origin - middle, direction, low[k], high[k])
+            seen = np.where((hit > 0.5) & (hit < seen), hit, seen)
+        return moved(scan, p * (seen / ranges)[:, None])
+
+    return changes("traffic", f"{count} vehicles at {fleet:.0f} m/s, platform at {own:.0f}", scan)
+
+
+def _entered(
+    origin: NDArray[np.float64], direction: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How far along rays (N, 3) a box (3,), (3,) is entered (N,), inf where it is not: by the three pairs of its sides."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = (low - origin) / direction, (high - origin) / direction
+    enter = np.nanmax(np.minimum(first, second), axis=1)
+    leave = np.nanmin(np.maximum(first, second), axis=1)
+    return np.where((enter < leave) & (enter > 0.0), enter, np.inf)
