@@ -127,11 +127,11 @@ def speaks_against(path: LidarPath, scans: Sequence[Scan], turning: Turning, up_
     Registrations may follow what drives around a platform at rest: things that stand stay, and what changes is on its lanes.
 
     Args:
-        path: unbroken, a pose for every scan.
+        path: through these scans; one that lacks a scan says nothing.
         scans, turning, up_lidar: as of `common_motion`.
         fixed: whether the surroundings fix its poses: only what stands may speak against it then.
     """
-    if len(scans) < FEWEST_SCANS:
+    if len(scans) < FEWEST_SCANS or len(path) < len(scans):
         return ""
     R = turning(path.time_ns)
     R_first = np.swapaxes(R[:1], 1, 2) @ R

@@ -20,7 +20,7 @@ from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 _QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at rest where the LiDAR cannot tell
 _FEWEST_QUIET_SAMPLES, _QUIET_TURN = 11, 0.03  # rad/s on average, an axis: the bias of a gyroscope in order
-_PARTS, _STEADY_ACCEL = 5, 0.1  # m/s²: what vibration leaves of a mean over a fifth of a second
+_PARTS, _STEADY_ACCEL = 5, 0.1  # m/s²: what means over a fifth of a second may differ by, besides what vibration leaves
 _PATIENCE_S, _PATIENT_SCANS = 3.0, 30
 UPRIGHT = 0.9
 """The cosine of an axis and the vertical from which on it is called upright."""
@@ -74,7 +74,8 @@ def broken(path: LidarPath) -> bool:
 
 
 def _shaken_only(imu: ImuSamples) -> bool:
-    """Whether all that the accelerometer shows is vibration: its means over parts of the window agree."""
+    """Whether all that the accelerometer shows is vibration: its means over parts of the window agree as well as that allows."""
     parts = np.array_split(imu.accel, _PARTS)
     means = np.array([part.mean(axis=0) for part in parts if len(part)])
-    return bool(means.std(axis=0).max() < _STEADY_ACCEL)
+    allowed = _STEADY_ACCEL + imu.accel.std(axis=0) / np.sqrt(len(imu) / _PARTS)
+    return bool((means.std(axis=0) < allowed).all())

@@ -120,6 +120,9 @@ def _start(seen: Beginning) -> Start:
     rest, doubt = weighed_rest(seen, path, rest, in_motion=motion is not None)
     if rest.determined or seen.imu_is_quiet(rest):
         return _static_start(seen, rest, doubt)
+    axes = _unshown(rest, seen.up_lidar)
+    if len(axes):
+        raise NotYet(f"{undecided(axes)}, and the IMU is not quiet ({seen.evidence}){WAITING}")
     return _moving_start(seen, path, motion)
 
 
