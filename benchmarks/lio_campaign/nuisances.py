@@ -80,6 +80,16 @@ def moved(scan: Scan, p_lidar: NDArray[np.floating], keep: NDArray[np.bool_] | N
     return moved if keep is None else moved.where(keep)
 
 
+def rays(scene: Scene, scan: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Where the rays of a scan began (N, 3) and went (N, 3), in the world, and how far (N,) [m]."""
+    truth, T = scene.truth, scene.T_imu_lidar
+    motion = truth.ground_truth(np.clip(scan.time_ns, truth.start_ns, truth.end_ns))
+    p = scan.p_lidar.astype(np.float64)
+    ranges = np.linalg.norm(p, axis=1)
+    direction = np.einsum("nij,nj->ni", motion.R_world_imu @ T[:3, :3], p / ranges[:, None])
+    return motion.R_world_imu @ T[:3, 3] + motion.p_world_imu, direction, ranges
+
+
 def _seeded(random: Random) -> Callable[[int], Random]:
     """A generator for every scan or block by its time: a stream that is read twice is the same twice."""
     seed = int(random.integers(1 << 62))
@@ -145,7 +155,7 @@ def _beams(scene: Scene, random: Random) -> Fault:
 def _people(scene: Scene, random: Random) -> Fault:
     """People walk about near the sensor."""
     count, speed = int(random.integers(1, 6)), float(random.uniform(0.4, 1.6))
-    truth, T = scene.truth, scene.T_imu_lidar
+    truth = scene.truth
     begin_ns = truth.start_ns
     span_s = (truth.end_ns - begin_ns) * 1e-9
     instants = begin_ns + np.linspace(0, truth.end_ns - begin_ns, 50).astype(np.int64)
@@ -165,15 +175,12 @@ def _people(scene: Scene, random: Random) -> Fault:
     def scan(scan: Scan) -> Scan:
         if not len(scan):
             return scan
-        motion = truth.ground_truth(np.clip(scan.time_ns, truth.start_ns, truth.end_ns))
         p = scan.p_lidar.astype(np.float64)
-        ranges = np.linalg.norm(p, axis=1)
-        direction = np.einsum("nij,nj->ni", motion.R_world_imu @ T[:3, :3], p / ranges[:, None])
-        origin = motion.R_world_imu @ T[:3, 3] + motion.p_world_imu
+        origin, direction, ranges = rays(scene, scan)
         seen = ranges.copy()
-        moved = centres(scan.time_ns)
+        centre = centres(scan.time_ns)
         for person in range(count):
-            away = origin[:, :2] - moved[:, person]
+            away = origin[:, :2] - centre[:, person]
             a = np.sum(direction[:, :2] ** 2, axis=1)
             b = np.sum(away * direction[:, :2], axis=1)
             c = np.sum(away**2, axis=1) - _PERSON_RADIUS_M**2

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Fault
-from lio_campaign.nuisances import Scene, changes, moved
+from lio_campaign.nuisances import Scene, changes, moved, rays
 
 _LANE_M = 3.6
 _LONG_M, _TRUCK_M, _WIDTH_M = 4.0, 16.0, 2.4
@@ -25,7 +25,7 @@ def traffic(scene: Scene, seed: int) -> Fault:
         seed: of the recording; its other draws do not depend on this one.
     """
     random = np.random.Generator(np.random.PCG64([seed, 5]))
-    truth, T = scene.truth, scene.T_imu_lidar
+    truth = scene.truth
     span_s = (truth.end_ns - truth.start_ns) * 1e-9
     ends = truth.ground_truth(np.array([truth.start_ns, truth.end_ns], np.int64))
     way = float(ends.p_world_imu[1, 0] - ends.p_world_imu[0, 0])
@@ -51,21 +51,17 @@ def traffic(scene: Scene, seed: int) -> Fault:
     def scan(scan: Scan) -> Scan:
         if not len(scan):
             return scan
-        motion = truth.ground_truth(np.clip(scan.time_ns, truth.start_ns, truth.end_ns))
-        p = scan.p_lidar.astype(np.float64)
-        ranges = np.linalg.norm(p, axis=1)
-        direction = np.einsum("nij,nj->ni", motion.R_world_imu @ T[:3, :3], p / ranges[:, None])
-        origin = motion.R_world_imu @ T[:3, 3] + motion.p_world_imu
+        origin, direction, ranges = rays(scene, scan)
         seconds = (scan.time_ns - truth.start_ns) * 1e-9
-        own_x = motion.p_world_imu[:, 0] - ends.p_world_imu[0, 0]
+        own_x = origin[:, 0] - ends.p_world_imu[0, 0]
         seen = ranges.copy()
         for k in range(count):
             # In the own lane a vehicle keeps its distance, whatever the platform does.
             travelled = own_x if lane[k] == 0 else forwards * speed[k] * seconds
-            middle = np.stack([x[k] + travelled, np.full(len(p), y[k]), np.full(len(p), z)], axis=1)
+            middle = np.stack([x[k] + travelled, np.full(len(scan), y[k]), np.full(len(scan), z)], axis=1)
             hit = _entered(origin - middle, direction, low[k], high[k])
             seen = np.where((hit > 0.5) & (hit < seen), hit, seen)
-        return moved(scan, p * (seen / ranges)[:, None])
+        return moved(scan, scan.p_lidar * (seen / ranges)[:, None])
 
     return changes("traffic", f"{count} vehicles at {fleet:.0f} m/s, platform at {own:.0f}", scan)
 

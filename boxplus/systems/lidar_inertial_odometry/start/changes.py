@@ -23,7 +23,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_r
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
 from boxplus.systems.lidar_inertial_odometry.start.beginning import UPRIGHT, WAITING, Beginning, NotYet, broken
 
-_COMPARED = 3  # pairs of scans
+_COMPARED = 3  # pairs of scans, the newest: what moved about may be gone
 _CHANGING = 0.0025  # share of points that change: at rest none, of a rosette up to 0.0022; on drives 0.0024 and more
 _RESTING_M_S = 0.5  # slower, a motion that was found is as much in doubt as rest
 
@@ -116,7 +116,7 @@ def _doubt_of_rest(seen: Beginning, path: LidarPath, guesses: Sequence[Turning])
     least = least_known_axis(path)
     if not _is_level(seen, least):
         return ""
-    pairs = pairwise(seen.scans[: _COMPARED + 1])
+    pairs = pairwise(seen.scans[-_COMPARED - 1 :])
     changing = float(np.mean([changed_share(first, second, guesses[0]) for first, second in pairs]))
     if changing < _CHANGING or _stands(seen, least):
         return ""
