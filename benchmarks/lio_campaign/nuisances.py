@@ -76,8 +76,8 @@ def changes(
 
 def moved(scan: Scan, p_lidar: NDArray[np.floating], keep: NDArray[np.bool_] | None = None) -> Scan:
     """The scan with other points, and of these only some; the sweep's ends stay."""
-    moved = replace(scan, p_lidar=p_lidar.astype(np.float32))
-    return moved if keep is None else moved.where(keep)
+    other = replace(scan, p_lidar=p_lidar.astype(np.float32))
+    return other if keep is None else other.where(keep)
 
 
 def rays(scene: Scene, scan: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
