@@ -25,6 +25,7 @@ _SAME_M = 0.3  # from one of them, a point is there again
 _FEWEST_ALL = 5
 _ALONE_M = 0.5  # farther from all others of its scan, a point is rain, dust or a mixed pixel
 _REPEATED, _SAMPLED = 0.75, 1000  # of the distance of neighbouring rays; rosettes 2 and more
+_SAME_RAY = 4  # decimals of its direction
 _CLOSE_RAD = 0.005  # a ray passes a point
 
 _Still = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -92,7 +93,8 @@ def changed_share(first: Scan, second: Scan, turning: Turning) -> float:
 
 def _rays_repeat(first: Scan, second: Scan) -> bool:
     """Whether two scans look in the same directions: those of the second lie nearer to the first's than to one another."""
-    tree, other = tree_of(_rays(first.p_lidar)[0]), _rays(second.p_lidar)[0]
+    tree = tree_of(_rays(first.p_lidar)[0])
+    other = np.unique(np.round(_rays(second.p_lidar)[0], _SAME_RAY), axis=0)  # without second returns
     some = other[:: max(len(other) // _SAMPLED, 1)]
     own = tree_of(other).nearest(some, 2).distances[:, 1]
     return bool(np.median(tree.nearest(some, 1).distances) < _REPEATED * np.median(own))
@@ -108,7 +110,7 @@ def _passed_by(p: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np
     return np.asarray((far < ranges[which].min(axis=1) - _SAME_M) & (apart[:, 0] < _CLOSE_RAD))
 
 
-def _rays(p: ArrayLike) -> _Still:
+def _rays(p: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Directions (N, 3) and distances (N,)."""
     p = np.asarray(p, np.float64)
     distance = np.maximum(np.linalg.norm(p, axis=1), 1e-9)

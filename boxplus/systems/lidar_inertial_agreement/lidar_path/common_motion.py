@@ -61,7 +61,7 @@ class CommonMotion:
         velocity: (3,) what most points have in common [m/s], along the first scan's axes.
         level: (3, 3) the projection onto the plane in which it lies.
         doubt: what speaks against it, a sentence; empty where nothing does.
-        may_rest: whether that speaks for rest, and not for another motion.
+        may_rest: whether the doubt is that the platform rests, and not that it moves otherwise.
     """
 
     pairs: Sequence[ChangedPoints]
@@ -104,7 +104,7 @@ def common_motion(scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.
     if not candidates:
         return None
     velocity, matched = max(candidates, key=lambda candidate: candidate[1])
-    if not _slowest(voting) < np.linalg.norm(velocity) < FASTEST_M_S or not _believed(voting, velocity):
+    if not _slowest(voting[0].seconds) < np.linalg.norm(velocity) < FASTEST_M_S or not _believed(voting, velocity):
         return None
     stay, go = _stay_and_go(scans, turning, R_first, np.broadcast_to(velocity, (len(_PAIRS), 3)), up_lidar)
     rests = stay > max(go, _FEWEST_STAYING) or shows_rest(scans, velocity / np.linalg.norm(velocity), up_lidar)
@@ -121,29 +121,25 @@ def common_motion(scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.
     return CommonMotion(pairs, R_first, velocity, level, doubt, may_rest)
 
 
-def speaks_against(path: LidarPath, scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.float64], fixed: bool) -> str:
+def speaks_against(path: LidarPath, scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.float64]) -> str:
     """What speaks against the motion of a path, as fast as one that is looked for, a sentence; empty where nothing does.
 
-    Registrations may follow what drives around a platform at rest: things that stand stay, and what changes is on its lanes.
+    Registrations may follow what drives around a platform at rest: things that stand stay where they are then.
 
     Args:
         path: through these scans; one that lacks a scan says nothing.
         scans, turning, up_lidar: as of `common_motion`.
-        fixed: whether the surroundings fix its poses: only what stands may speak against it then.
     """
     if len(scans) < FEWEST_SCANS or len(path) < len(scans):
         return ""
     R = turning(path.time_ns)
     R_first = np.swapaxes(R[:1], 1, 2) @ R
-    apart = np.diff(path.p_path_lidar, axis=0) / np.diff(path.time_ns)[:, None] * 1e9
-    velocities = apart[list(_PAIRS)]
-    pairs = [_pair(scans, k, turning, R_first[k]) for k in _PAIRS]
-    if np.linalg.norm(velocities, axis=1).min() < _slowest(pairs):
+    seconds = np.diff(path.time_ns)[:, None] * 1e-9
+    velocities = (np.diff(path.p_path_lidar, axis=0) / seconds)[list(_PAIRS)]
+    if np.linalg.norm(velocities, axis=1).min() < _slowest(float(seconds[0, 0])):
         return ""
     stay, go = _stay_and_go(scans, turning, R_first, velocities, up_lidar)
-    if _stays(stay, go):
-        return _staying(stay, go, float(np.linalg.norm(velocities[0])))
-    return "" if fixed or _matched(pairs, velocities) < _FEWEST_MATCHED else _traffic(pairs, velocities, up_lidar)
+    return _staying(stay, go, float(np.linalg.norm(velocities[0]))) if _stays(stay, go) else ""
 
 
 def _stay_and_go(
@@ -178,18 +174,14 @@ def _pair(scans: Sequence[Scan], k: int, turning: Turning, R: NDArray[np.float64
     return ChangedPoints(pair.p_before @ R.T, pair.p_after @ R.T, pair.since_before, pair.since_after, pair.seconds)
 
 
-def _slowest(pairs: Sequence[ChangedPoints]) -> float:
-    return min(_SLOWEST_M_S, _SLOWEST_M / pairs[0].seconds)
+def _slowest(seconds: float) -> float:
+    """The slowest motion that is looked for [m/s], for scans so far apart."""
+    return min(_SLOWEST_M_S, _SLOWEST_M / seconds)
 
 
 def _traffic(pairs: Sequence[ChangedPoints], velocity: NDArray[np.float64], up: NDArray[np.float64]) -> str:
-    """That what changes is where traffic beside a platform at rest would be, a sentence; empty where it is not.
-
-    Args:
-        pairs: what changes.
-        velocity: (3,), or one a pair (n, 3), along the first scan's axes, as `up` (3,).
-    """
-    velocity, matched = velocity.reshape(-1, 3)[0], np.concatenate(_again(pairs, velocity))
+    """That what changes is where traffic beside a platform at rest would be, a sentence; empty where it is not."""
+    matched = np.concatenate(_again(pairs, velocity))
     along = velocity / np.linalg.norm(velocity)
     across = matched @ np.cross(up, along)
     far = np.abs(across) > ASIDE_M
@@ -216,7 +208,7 @@ def explains_changes(scans: Sequence[Scan], turning: Turning, twists: Sequence[T
         pair, (rate, velocity) = changed_points(scans[k], scans[k + 1], turning), twists[k + 1]
         pairs.append(pair)
         velocities.append(so3.exp(0.5 * pair.seconds * rate) @ velocity)
-    if np.linalg.norm(velocities, axis=1).min() < _slowest(pairs) or not _believed(pairs, np.array(velocities)):
+    if np.linalg.norm(velocities, axis=1).min() < _slowest(pairs[0].seconds) or not _believed(pairs, np.array(velocities)):
         return False
     missing = np.concatenate([pair.shifts(velocity)[1] for pair, velocity in zip(pairs, velocities, strict=True)])
     along = velocities[0] / np.linalg.norm(velocities[0])

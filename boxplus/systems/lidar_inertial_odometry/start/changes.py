@@ -17,7 +17,12 @@ from boxplus._words import signed
 from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import changed_share
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import common_motion, speaks_against
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist, lidar_path
-from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import least_known_axis, one_speed, well_known
+from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
+    least_known_axis,
+    mean_velocity,
+    one_speed,
+    well_known,
+)
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
@@ -50,7 +55,8 @@ def following_changes(seen: Beginning, path: LidarPath) -> Common | None:
         return None
     held = held_path(seen, seen.guesses, motion.twists())
     shown = found and one_speed(path, held)
-    if motion.doubt and (shown or (motion.may_rest and seen.waited_long)):  # the path is doubted, too, where it is not sound
+    rests = found and float(np.linalg.norm(mean_velocity(path))) < _RESTING_M_S
+    if motion.doubt and (shown or (rests and motion.may_rest and seen.waited_long)):  # the path is asked on its own
         return None
     if motion.doubt:
         raise NotYet(f"the surroundings do not show how fast the platform moves ({seen.evidence}): {motion.doubt}{WAITING}")
@@ -70,29 +76,27 @@ def held_path(seen: Beginning, guesses: Sequence[Turning], motion: Sequence[Twis
     return path
 
 
-def weighed_rest(seen: Beginning, path: LidarPath, rest: Rest, in_motion: bool) -> tuple[Rest, str]:
+def weighed_rest(seen: Beginning, path: LidarPath, rest: Rest) -> tuple[Rest, str]:
     """Rest, less the open axes that things that stand close, or with one that is in doubt; and why it is, a sentence.
 
     Args:
         seen: what the start has to go by.
         path: at rest by its registrations.
         rest: what these show.
-        in_motion: whether what changes shows the same motion as they do.
 
     Raises:
         NotYet: rest is in doubt, and later scans, or a quiet IMU, may tell.
     """
-    axes = [axis for axis in rest.open_axes if not _stands(seen, axis)]
-    rest = replace(rest, open_axes=np.array(axes).reshape(-1, 3))
-    if not axes and (in_motion or len(path) < 2):
-        return rest, ""
-    doubt = _doubt_of_rest(seen, path, seen.guesses)
+    axes = np.array([axis for axis in rest.open_axes if not _stands(seen, axis)]).reshape(-1, 3)
+    rest, doubt = replace(rest, open_axes=axes), _doubt_of_rest(seen, path, seen.guesses)
     if not doubt:
         return rest, ""
-    if not axes:
-        rest = replace(rest, open_axes=least_known_axis(path)[None])
+    level = np.array([axis for axis in axes if _is_level(seen, axis)]).reshape(-1, 3)
+    if not len(level):
+        level = least_known_axis(path)[None]
+        rest = replace(rest, open_axes=np.concatenate([axes, level]))
     if not seen.waited_long or not seen.imu_is_quiet(rest):
-        raise NotYet(f"{undecided(rest.open_axes)} ({seen.evidence}): {doubt}{WAITING}")
+        raise NotYet(f"{undecided(level)} ({seen.evidence}): {doubt}{WAITING}")
     return rest, doubt
 
 
@@ -106,12 +110,12 @@ def doubt_of_motion(seen: Beginning, path: LidarPath, turning: Turning, speed: f
     """What speaks against the motion of a path, a sentence; empty where nothing does."""
     if speed < _RESTING_M_S:
         return _doubt_of_rest(seen, path, [turning])
-    return speaks_against(path, seen.scans, turning, seen.up_lidar, well_known(path))
+    return speaks_against(path, seen.scans, turning, seen.up_lidar)
 
 
 def _doubt_of_rest(seen: Beginning, path: LidarPath, guesses: Sequence[Turning]) -> str:
     """That much changes from scan to scan, as on a drive, and nothing that stands shows rest; empty where that is not so."""
-    if not guesses or well_known(path):
+    if not guesses or len(path) < 2 or well_known(path):
         return ""
     least = least_known_axis(path)
     if not _is_level(seen, least):

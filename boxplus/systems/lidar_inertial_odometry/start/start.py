@@ -65,7 +65,7 @@ class Start:
         text: one sentence with the evidence.
         warning: what could not be decided, a sentence; empty when all was.
         unshown_axes: (K, 3) unit axes in the world along which rest was taken for granted.
-        doubted: whether something speaks against that; where nothing does, nothing speaks for it either.
+        doubted: whether something speaks against that rest.
     """
 
     kind: Literal["static", "moving"]
@@ -115,9 +115,9 @@ def _start(seen: Beginning) -> Start:
     rest = judge_rest(path, seen.scans, seen.registration)
     seen.note(rest)
     _check_gyroscope(seen, path, rest)
-    if not rest.at_rest:
+    if not rest.at_rest or motion is not None:  # along what the scene leaves open, what changes may show a motion
         return _moving_start(seen, path, motion)
-    rest, doubt = weighed_rest(seen, path, rest, in_motion=motion is not None)
+    rest, doubt = weighed_rest(seen, path, rest)
     if rest.determined or seen.imu_is_quiet(rest):
         return _static_start(seen, rest, doubt)
     axes = _unshown(rest, seen.up_lidar)

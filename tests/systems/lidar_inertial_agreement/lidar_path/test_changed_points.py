@@ -49,6 +49,12 @@ def test_only_a_drive_changes_what_a_lidar_sees(lidar: SpinningLidar | RosetteLi
     assert changed_share(*street(lidar, 15.0), unturned) > 0.0025
 
 
+def test_second_returns_make_no_rosette_of_a_spinning_lidar() -> None:
+    drive = [street(SpinningLidar(azimuth_steps=600), 15.0)[k] for k in range(2)]
+    twice = [Scan.from_arrays(np.repeat(scan.p_lidar, 2, axis=0), np.repeat(scan.time_ns, 2)) for scan in drive]
+    assert changed_share(twice[0], twice[1], unturned) > 0.5 * changed_share(drive[0], drive[1], unturned) > 0.01
+
+
 def test_what_is_alone_in_its_scan_is_no_change() -> None:
     first, second = street(SpinningLidar(azimuth_steps=600), 0.0)
     drops = np.random.default_rng(3).uniform(-25.0, 25.0, (len(second) // 40, 3)).astype(np.float32)
