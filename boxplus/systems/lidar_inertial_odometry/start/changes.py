@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from boxplus._words import signed
 from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import changed_share
-from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import common_motion, speaks_against
+from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import common_motion
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist, lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
     least_known_axis,
@@ -30,7 +30,7 @@ from boxplus.systems.lidar_inertial_odometry.start.beginning import UPRIGHT, WAI
 
 _COMPARED = 3  # pairs of scans, the newest: what moved about may be gone
 _CHANGING = 0.0025  # share of points that change: at rest none, of a rosette up to 0.0022; on drives 0.0024 and more
-_RESTING_M_S = 0.5  # slower, a motion that was found is as much in doubt as rest
+_RESTING_M_S = 0.5  # slower, a path may be one of rest
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,13 +104,6 @@ def undecided(axes: NDArray[np.float64]) -> str:
     """That nothing shows rest along some axes (K, 3), the beginning of a sentence."""
     along = " and ".join(signed(axis, 2) for axis in axes)
     return f"the surroundings do not show whether the platform moves along {along} (LiDAR axes)"
-
-
-def doubt_of_motion(seen: Beginning, path: LidarPath, turning: Turning, speed: float) -> str:
-    """What speaks against the motion of a path, a sentence; empty where nothing does."""
-    if speed < _RESTING_M_S:
-        return _doubt_of_rest(seen, path, [turning])
-    return speaks_against(path, seen.scans, turning, seen.up_lidar)
 
 
 def _doubt_of_rest(seen: Beginning, path: LidarPath, guesses: Sequence[Turning]) -> str:

@@ -15,6 +15,7 @@ from boxplus.filtering.nav_state import T_V, NavState
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
+from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import speaks_against
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
     mean_velocity,
@@ -29,7 +30,6 @@ from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.start.beginning import UPRIGHT, WAITING, Beginning, NotYet, broken
 from boxplus.systems.lidar_inertial_odometry.start.changes import (
     Common,
-    doubt_of_motion,
     following_changes,
     held_path,
     undecided,
@@ -253,7 +253,7 @@ def _moving_start(seen: Beginning, path: LidarPath, motion: Common | None = None
             f"well at {np.linalg.norm(other):.1f} m/s as at {speed:.1f} m/s"
         )
     misfit = f"batch over {len(scans)} scans fits to {fit.sigma * 100:.1f} cm"
-    doubt = doubt_of_motion(seen, path, guesses[0], speed) if not follow else ""
+    doubt = speaks_against(path, scans, guesses[0], seen.up_lidar) if not follow else ""
     if doubt:
         raise seen.not_moving(f"the surroundings do not show how fast the platform moves: {doubt}")
     text = f"moving at {speed:.2f} ± {sigma:.2f} m/s: {seen.evidence}; {misfit}"
