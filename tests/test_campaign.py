@@ -23,7 +23,7 @@ from boxplus.simulation import Simulation, faults, write_recording
 from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
-PARTS = ("draws", "judge", "nuisances", "places", "real", "report", "run", "spoil")
+PARTS = ("draws", "judge", "nuisances", "places", "real", "report", "run", "spoil", "traffic")
 
 
 @pytest.fixture(scope="module")
@@ -251,6 +251,24 @@ def test_nuisances_follow_from_their_seed_and_leave_the_rest_alone(campaign: Sim
             assert cosine.min() > np.cos(np.deg2rad(0.5)), name
         same = all(np.array_equal(one.accel, other.accel) for one, other in zip(samples, read, strict=True))
         assert same == (name not in ("losses", "imu_errors")), name
+
+
+def test_traffic_stands_in_the_way_of_rays_the_same_every_time(campaign: SimpleNamespace) -> None:
+    wanted = {"fault": "none", "world": "highway", "motion": "fast_constant", "sensor": "spinning16"}
+    seed = next(seed for seed in range(2000) if campaign.draws.draw_kinds(seed, fast=True).matches(wanted))
+    simulation = replace(campaign.draws.draw(seed, fast=True), duration_s=1.0).truth()
+    lidar = simulation.scenario.lidar
+    scene = campaign.nuisances.Scene(simulation, simulation.T_imu_lidar, lidar.channels, lidar.vertical_fov_deg)
+    plain = [event for event in simulation.events() if isinstance(event, Scan)]
+    first, second = (list(campaign.traffic.traffic(scene, seed).events(plain)) for _ in range(2))
+    nearer = 0
+    for scan, one, other in zip(plain, first, second, strict=True):
+        np.testing.assert_array_equal(one.p_lidar, other.p_lidar)
+        ranges, found = np.linalg.norm(scan.p_lidar, axis=1), np.linalg.norm(one.p_lidar, axis=1)
+        assert np.all(found < ranges * (1.0 + 1e-6))
+        assert np.sum(scan.p_lidar * one.p_lidar, axis=1).min() > 0.0
+        nearer += np.count_nonzero(found < ranges - 0.1)
+    assert nearer > 0
 
 
 def test_the_simulator_tells_a_smooth_tunnel_from_a_room(campaign: SimpleNamespace) -> None:

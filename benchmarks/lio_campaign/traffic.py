@@ -36,15 +36,11 @@ def traffic(scene: Scene, seed: int) -> Fault:
     against = lane > 0
     scatter = random.uniform(0.0, 0.06)
     speed = fleet * random.uniform(1.0 - scatter, 1.0 + scatter, count) * np.where(against, -1.0, 1.0)
-    speed[lane == 0] = own  # in the own lane nobody is run over
     length = random.uniform(_LONG_M, _TRUCK_M, count)
     height = np.where(length > 8.0, 3.9, 1.6)
-    x = ends.p_world_imu[0, 0] + random.uniform(-90.0, 90.0, count)
-    clear = 0.5 * length + _NEAREST_M
-    offset = x - ends.p_world_imu[0, 0]
-    x = np.where((lane == 0) & (np.abs(offset) < clear), ends.p_world_imu[0, 0] + np.copysign(clear + 5.0, offset), x)
-    y = ends.p_world_imu[0, 1] + forwards * _LANE_M * lane
-    z = float(ends.p_world_imu[0, 2]) - _ROAD_BELOW_M
+    ahead, clear = random.uniform(-90.0, 90.0, count), 0.5 * length + _NEAREST_M
+    ahead = np.where((lane == 0) & (np.abs(ahead) < clear), np.copysign(clear + 5.0, ahead), ahead)
+    begin = ends.p_world_imu[0] + np.stack([ahead, forwards * _LANE_M * lane, np.full(count, -_ROAD_BELOW_M)], axis=1)
     low = np.stack([-0.5 * length, np.full(count, -0.5 * _WIDTH_M), np.zeros(count)], axis=1)
     high = np.stack([0.5 * length, np.full(count, 0.5 * _WIDTH_M), height], axis=1)
 
@@ -57,9 +53,9 @@ def traffic(scene: Scene, seed: int) -> Fault:
         seen = ranges.copy()
         for k in range(count):
             # In the own lane a vehicle keeps its distance, whatever the platform does.
-            travelled = own_x if lane[k] == 0 else forwards * speed[k] * seconds
-            middle = np.stack([x[k] + travelled, np.full(len(scan), y[k]), np.full(len(scan), z)], axis=1)
-            hit = _entered(origin - middle, direction, low[k], high[k])
+            away = origin - begin[k]
+            away[:, 0] -= own_x if lane[k] == 0 else forwards * speed[k] * seconds
+            hit = _entered(away, direction, low[k], high[k])
             seen = np.where((hit > 0.5) & (hit < seen), hit, seen)
         return moved(scan, scan.p_lidar * (seen / ranges)[:, None])
 

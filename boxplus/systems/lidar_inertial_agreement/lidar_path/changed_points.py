@@ -85,6 +85,8 @@ def changed_share(first: Scan, second: Scan, turning: Turning) -> float:
         return 0.0
     after = every[:: -(-len(every) // _MOST_RAW)]
     changed = after[_unexplained(after, before)]
+    if not len(changed):  # at rest where nothing moves, which is what most starts are
+        return 0.0
     changed = changed[tree_of(every).nearest(changed, 2).distances[:, 1] < _ALONE_M]
     if not _rays_repeat(first, second):
         changed = changed[_passed_by(changed, before)]

@@ -96,8 +96,7 @@ def common_motion(scans: Sequence[Scan], turning: Turning, up_lidar: NDArray[np.
     if len(scans) < FEWEST_SCANS:
         return None
     level = np.eye(3) - np.outer(up_lidar, up_lidar)
-    R = turning(np.array([middle_of(scan) for scan in scans]))
-    R_first = np.swapaxes(R[:1], 1, 2) @ R
+    R_first = _turned(turning, np.array([middle_of(scan) for scan in scans]))
     first = {k: _pair(scans, k, turning, R_first[k]) for k in _PAIRS}
     voting = list(first.values())
     candidates = [_refined(voting, velocity, level) for velocity in _voted(voting, level)]
@@ -132,14 +131,19 @@ def speaks_against(path: LidarPath, scans: Sequence[Scan], turning: Turning, up_
     """
     if len(scans) < FEWEST_SCANS or len(path) < len(scans):
         return ""
-    R = turning(path.time_ns)
-    R_first = np.swapaxes(R[:1], 1, 2) @ R
+    R_first = _turned(turning, path.time_ns)
     seconds = np.diff(path.time_ns)[:, None] * 1e-9
     velocities = (np.diff(path.p_path_lidar, axis=0) / seconds)[list(_PAIRS)]
     if np.linalg.norm(velocities, axis=1).min() < _slowest(float(seconds[0, 0])):
         return ""
     stay, go = _stay_and_go(scans, turning, R_first, velocities, up_lidar)
     return _staying(stay, go, float(np.linalg.norm(velocities[0]))) if _stays(stay, go) else ""
+
+
+def _turned(turning: Turning, time_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(K, 3, 3) attitudes at some times [ns], along the axes at the first of them."""
+    R = turning(time_ns)
+    return np.swapaxes(R[:1], 1, 2) @ R
 
 
 def _stay_and_go(

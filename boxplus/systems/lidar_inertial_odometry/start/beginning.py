@@ -22,8 +22,7 @@ _QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at res
 _FEWEST_QUIET_SAMPLES, _QUIET_TURN = 11, 0.03  # rad/s on average, an axis: the bias of a gyroscope in order
 _PARTS, _STEADY_ACCEL = 5, 0.1  # m/s²: what means over a fifth of a second may differ by, besides what vibration leaves
 _PATIENCE_S, _PATIENT_SCANS = 3.0, 30
-UPRIGHT = 0.9
-"""The cosine of an axis and the vertical from which on it is called upright."""
+_UPRIGHT = 0.9  # cosine of an axis and the vertical
 WAITING = "; waiting for more data"
 """How a refusal ends that the next scans may lift."""
 
@@ -55,6 +54,10 @@ class Beginning:
 
     def note(self, rest: Rest) -> None:
         self.evidence += f"; the LiDAR alone moves with {rest.speed * 100:.1f} cm/s and {np.degrees(rest.turn_rate):.2f} deg/s"
+
+    def level(self, axes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Those of some axes (K, 3) of the LiDAR that lie across the vertical: hardly anything begins at a constant climb."""
+        return axes[np.abs(axes @ self.up_lidar) < _UPRIGHT].reshape(-1, 3)
 
     def imu_is_quiet(self, rest: Rest) -> bool:
         """Whether the IMU shows nothing but vibration and biases, as it does at rest and at a constant speed."""

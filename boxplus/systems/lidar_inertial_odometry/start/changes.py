@@ -1,7 +1,7 @@
 """What changes from scan to scan, asked at the start: it may show a motion that the registrations miss, and doubts theirs.
 
 Rest that the registrations find is believed where what they see stays as it is, or where things that stand on the ground show it;
-a motion where no more of these stay than go by (docs/agreement.md).
+a motion where no more of these stay than go by (docs/lidar_inertial_odometry.md, section 10).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
-from boxplus.systems.lidar_inertial_odometry.start.beginning import UPRIGHT, WAITING, Beginning, NotYet, broken
+from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING, Beginning, NotYet, broken
 
 _COMPARED = 3  # pairs of scans, the newest: what moved about may be gone
 _CHANGING = 0.0025  # share of points that change: at rest none, of a rosette up to 0.0022; on drives 0.0024 and more
@@ -55,10 +55,10 @@ def following_changes(seen: Beginning, path: LidarPath) -> Common | None:
         return None
     held = held_path(seen, seen.guesses, motion.twists())
     shown = found and one_speed(path, held)
-    rests = found and float(np.linalg.norm(mean_velocity(path))) < _RESTING_M_S
-    if motion.doubt and (shown or (rests and motion.may_rest and seen.waited_long)):  # the path is asked on its own
-        return None
     if motion.doubt:
+        rests = found and float(np.linalg.norm(mean_velocity(path))) < _RESTING_M_S
+        if shown or (rests and motion.may_rest and seen.waited_long):  # the path is asked on its own
+            return None
         raise NotYet(f"the surroundings do not show how fast the platform moves ({seen.evidence}): {motion.doubt}{WAITING}")
     way = held.p_path_lidar[-1] - held.p_path_lidar[0]
     return Common(motion.twists(way / np.linalg.norm(way)), shown)
@@ -88,10 +88,10 @@ def weighed_rest(seen: Beginning, path: LidarPath, rest: Rest) -> tuple[Rest, st
         NotYet: rest is in doubt, and later scans, or a quiet IMU, may tell.
     """
     axes = np.array([axis for axis in rest.open_axes if not _stands(seen, axis)]).reshape(-1, 3)
-    rest, doubt = replace(rest, open_axes=axes), _doubt_of_rest(seen, path, seen.guesses)
+    rest, doubt = replace(rest, open_axes=axes), _doubt_of_rest(seen, path)
     if not doubt:
         return rest, ""
-    level = np.array([axis for axis in axes if _is_level(seen, axis)]).reshape(-1, 3)
+    level = seen.level(axes)
     if not len(level):
         level = least_known_axis(path)[None]
         rest = replace(rest, open_axes=np.concatenate([axes, level]))
@@ -106,15 +106,15 @@ def undecided(axes: NDArray[np.float64]) -> str:
     return f"the surroundings do not show whether the platform moves along {along} (LiDAR axes)"
 
 
-def _doubt_of_rest(seen: Beginning, path: LidarPath, guesses: Sequence[Turning]) -> str:
+def _doubt_of_rest(seen: Beginning, path: LidarPath) -> str:
     """That much changes from scan to scan, as on a drive, and nothing that stands shows rest; empty where that is not so."""
-    if not guesses or len(path) < 2 or well_known(path):
+    if not seen.guesses or len(path) < 2 or well_known(path):
         return ""
     least = least_known_axis(path)
-    if not _is_level(seen, least):
+    if not len(seen.level(least[None])):
         return ""
     pairs = pairwise(seen.scans[-_COMPARED - 1 :])
-    changing = float(np.mean([changed_share(first, second, guesses[0]) for first, second in pairs]))
+    changing = float(np.mean([changed_share(first, second, seen.guesses[0]) for first, second in pairs]))
     if changing < _CHANGING or _stands(seen, least):
         return ""
     return f"{changing:.1%} of what the LiDAR sees changes from scan to scan, and nothing that stands shows that it rests"
@@ -122,8 +122,4 @@ def _doubt_of_rest(seen: Beginning, path: LidarPath, guesses: Sequence[Turning])
 
 def _stands(seen: Beginning, axis: NDArray[np.float64]) -> bool:
     """Whether what stands on the ground shows rest along an axis (3,) of the LiDAR, across the vertical."""
-    return _is_level(seen, axis) and shows_rest(seen.scans, axis, seen.up_lidar)
-
-
-def _is_level(seen: Beginning, axis: NDArray[np.float64]) -> bool:
-    return bool(abs(axis @ seen.up_lidar) < UPRIGHT)
+    return len(seen.level(axis[None])) == 1 and shows_rest(seen.scans, axis, seen.up_lidar)

@@ -27,7 +27,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import show
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.start.beginning import UPRIGHT, WAITING, Beginning, NotYet, broken
+from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING, Beginning, NotYet, broken
 from boxplus.systems.lidar_inertial_odometry.start.changes import (
     Common,
     following_changes,
@@ -120,7 +120,7 @@ def _start(seen: Beginning) -> Start:
     rest, doubt = weighed_rest(seen, path, rest)
     if rest.determined or seen.imu_is_quiet(rest):
         return _static_start(seen, rest, doubt)
-    axes = _unshown(rest, seen.up_lidar)
+    axes = seen.level(rest.open_axes)
     if len(axes):
         raise NotYet(f"{undecided(axes)}, and the IMU is not quiet ({seen.evidence}){WAITING}")
     return _moving_start(seen, path, motion)
@@ -198,7 +198,7 @@ def _static_start(seen: Beginning, rest: Rest, doubt: str) -> Start:
         )
     state, covariance = static_state(seen.imu, seen.extrinsic, seen.config)
     R_imu_lidar = seen.extrinsic.R_imu_lidar
-    axes = _unshown(rest, R_imu_lidar.T @ seen.imu.accel.mean(axis=0) / seen.accel_norm)
+    axes = seen.level(rest.open_axes)
     return Start(
         "static",
         seen.scans[0].end_ns,
@@ -287,11 +287,6 @@ def _checked_speed(seen: Beginning, state: NavState, covariance: NDArray[np.floa
             "more or less"
         )
     return sigma
-
-
-def _unshown(rest: Rest, up_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(K, 3) axes along which nothing shows rest, LiDAR frame; up and down, hardly anything begins at a constant speed."""
-    return rest.open_axes[np.abs(rest.open_axes @ up_lidar) < UPRIGHT].reshape(-1, 3)
 
 
 def _undecided(axes: NDArray[np.float64], doubt: str) -> str:
