@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(work)
         return
     lines: list[dict[str, Any]] = []
-    for line in _runs(*work, options.jobs):
+    for line in _runs(*work, options):
         lines.append(line)
         if options.out is not None:
             with options.out.open("a", encoding="utf-8") as file:
@@ -82,24 +82,24 @@ def _work(options: argparse.Namespace) -> tuple[Run, list[int]] | str:
     return functools.partial(run_real, shared=options.shared, rough=options.rough), list(range(begin, begin + options.real))
 
 
-def _runs(run: Run, seeds: Sequence[int], jobs: int) -> Iterator[dict[str, Any]]:
-    """Results as they come, from `jobs` processes."""
-    if jobs == 1:
-        yield from map(run, seeds)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+def _runs(run: Run, seeds: Sequence[int], options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Results as they come, from processes beside this one."""
+    with ProcessPoolExecutor(options.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
         futures = {pool.submit(run, seed): seed for seed in seeds}
         for future in as_completed(futures):
             problem = future.exception()
-            yield future.result() if problem is None else _crashed(futures[future], problem)
+            yield future.result() if problem is None else _crashed(futures[future], problem, options)
 
 
-def _crashed(seed: int, problem: BaseException) -> dict[str, Any]:
+def _crashed(seed: int, problem: BaseException, options: argparse.Namespace) -> dict[str, Any]:
     """The line of a run that ended in an exception nobody raised on purpose: a user would see a traceback."""
-    seen = "".join(traceback.format_exception(problem))
-    facts = {"seed": seed, "real": False, **asdict(draw_kinds(seed)), "detail": type(problem).__name__, "verdict": "crashed"}
-    empty = {"reasons": ["no estimate"], "flags": [seen], "false_alarm": "", "worst_m": None, "falsely_weak_scans": []}
-    return facts | empty | {"exit_code": 1, "cpu_s": 0.0}
+    seen, real = "".join(traceback.format_exception(problem)), options.real is not None
+    kinds = asdict(draw_kinds(seed, fast=options.fast))
+    if real:  # drawn with its recording, which may be what is missing
+        kinds = dict.fromkeys(kinds, "unknown")
+    facts = {"seed": seed, "real": real, "rough": options.rough, "fast": options.fast, **kinds, "detail": type(problem).__name__}
+    verdict = {"verdict": "crashed", "reasons": ["no estimate"], "flags": [seen], "false_alarm": ""}
+    return facts | verdict | {"worst_m": None, "falsely_weak_scans": [], "exit_code": 1, "cpu_s": 0.0}
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:

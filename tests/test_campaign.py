@@ -331,11 +331,12 @@ def test_real_recordings_are_left_out_with_a_reason(campaign: SimpleNamespace, t
 def test_a_crash_is_counted_and_does_not_end_the_campaign(campaign: SimpleNamespace) -> None:
     script = importlib.import_module("campaign")
     try:
-        line = script._crashed(3, ZeroDivisionError("by nothing"))
-        assert "ZeroDivisionError: by nothing" in line["flags"][0]
-        text = campaign.report.report([line])
-        assert "== crashed: 1 ==" in text
-        assert "python benchmarks/campaign.py --seeds 3:4 -v" in text
+        for how in ([], ["--fast"], ["--real", "1", "--rough"]):
+            line = script._crashed(3, ZeroDivisionError("by nothing"), script._parse(how))
+            assert "ZeroDivisionError: by nothing" in line["flags"][0]
+            text = campaign.report.report([line])
+            assert "== crashed: 1 ==" in text
+            assert f"python benchmarks/campaign.py {' '.join(['--seeds 3:4 -v', *how])}\n" in text + "\n"
         assert script._work(script._parse(["--seeds", "0:50", "--only", "fault=none"]))[1] == [
             seed for seed in range(50) if campaign.draws.draw_kinds(seed).fault == "none"
         ]

@@ -83,8 +83,7 @@ def _cases(lines: Sequence[Line], verdict: str, name: str) -> str:
 def command(line: Line) -> str:
     """What repeats a run."""
     how = " --real 1" if line["real"] else " --bag" if line["bag"] == "command" else ""
-    how += " --fast" if line["motion"].startswith("fast_") else ""
-    how += " --rough" if line.get("nuisance", "none") != "none" else ""
+    how += "".join(f" --{kind}" for kind in ("fast", "rough") if line[kind])
     return f"python benchmarks/campaign.py --seeds {line['seed']}:{line['seed'] + 1} -v{how}"
 
 

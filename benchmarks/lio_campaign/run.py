@@ -71,7 +71,7 @@ def run_seed(seed: int, *, command_line: bool = False, rough: bool = False, fast
     suspects: list[dict[str, float]] = []
     if _looked_at(made) and outcome.estimate is not None:
         suspects = falsely_weak(outcome.estimate, simulation)
-    facts = {"seed": seed, "real": False, **asdict(made.kinds), "detail": made.detail, "duration_s": round(made.duration_s, 2)}
+    facts = {"seed": seed, "real": False, "rough": rough, "fast": fast, **_drawn(made)}
     if command_line:
         facts["bag"] = "command"
     return facts | _judged(made, outcome, simulation, suspects) | clock.read()
@@ -94,8 +94,12 @@ def run_real(seed: int, shared: Path, *, rough: bool = False) -> dict[str, Any]:
             made = _roughened(made, *draw_nuisances(scene, seed))
         outcome = _in_process(lambda options: opened_real(made, options), made, work)
         truth = made.truth()
-    facts = {"seed": seed, "real": True, **asdict(made.kinds), "detail": made.detail, "duration_s": round(made.duration_s, 2)}
+    facts = {"seed": seed, "real": True, "rough": rough, "fast": False, **_drawn(made)}
     return facts | _judged(made, outcome, truth, []) | clock.read()
+
+
+def _drawn(made: _AnyDraw) -> dict[str, Any]:
+    return asdict(made.kinds) | {"detail": made.detail, "duration_s": round(made.duration_s, 2)}
 
 
 def _roughened(made: _AnyDraw, nuisance: Fault, names: str) -> _AnyDraw:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,9 +21,10 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import (
     CommonMotion,
     common_motion,
     explains_changes,
+    speaks_against,
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, true_poses, true_twists
 
@@ -161,6 +163,37 @@ def test_at_rest_nothing_changes_and_what_stands_stays(speed: float) -> None:
     scans, imu = data(road)
     assert (changed_share(scans[0], scans[1], gyro_guesses(imu, np.eye(3))[0]) < 0.003) == (speed == 0.0)
     assert shows_rest(scans, np.array([1.0, 0.0, 0.0]), UP) == (speed == 0.0)
+
+
+def street(speed: float) -> Simulation:
+    motion = manoeuvres.constant_velocity(2.1, (0.0, 0.0, 1.8), (speed, 0.0, 0.0), np.eye(3))
+    return Simulation(Scenario("street", sites.street(200.0, seed=2), motion, LIDAR, T_imu_lidar=np.eye(4)), 4, 1.1)
+
+
+def along(path: LidarPath, speed: float) -> LidarPath:
+    """The path with a motion added to it [m/s] that nothing shows."""
+    seconds = (path.time_ns - path.time_ns[0])[:, None] * 1e-9
+    return replace(path, p_path_lidar=path.p_path_lidar + seconds * [speed, 0.0, 0.0])
+
+
+@pytest.mark.slow
+def test_what_stands_and_stays_speaks_against_a_path_that_drives() -> None:
+    """As registrations find it that follow what drives around a platform at rest; slow ones are theirs to tell."""
+    scans, imu = data(street(0.0))
+    turning = gyro_guesses(imu, np.eye(3))[0]
+    rest = lidar_path(scans, CONFIG, [turning])
+    assert " points stay and " in speaks_against(along(rest, 15.0), scans, turning, UP)
+    for path, through in [(rest, scans), (along(rest, 5.0), scans), (along(rest, 15.0), [*scans, scans[-1]])]:
+        assert speaks_against(path, through, turning, UP) == ""
+
+
+@pytest.mark.slow
+def test_nothing_speaks_against_a_path_that_drives_as_the_platform_does() -> None:
+    simulation = street(15.0)
+    scans, imu = data(simulation)
+    turning = gyro_guesses(imu, np.eye(3))[0]
+    path = lidar_path(scans, CONFIG, [turning], undistort=True, expected=true_twists(simulation, scans))
+    assert speaks_against(path, scans, turning, UP) == ""
 
 
 def test_too_few_scans_say_nothing() -> None:
