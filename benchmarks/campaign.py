@@ -9,6 +9,7 @@
     python benchmarks/campaign.py --fast --seeds 0:40         # on roads, at up to 33 m/s
     python benchmarks/campaign.py --rough --seeds 0:40        # with what real recordings have besides: rain, people, lost packets
     python benchmarks/campaign.py --merge a.jsonl b.jsonl     # tables of earlier runs, nothing is run; takes --only as well
+    python benchmarks/campaign.py --nightly --against runs.jsonl  # and what ended otherwise than before
 
 A seed draws world, motion, sensors, mounting and, in half of the runs, one fault. Every run ends `right`, flagged with the `right
 cause`, `flagged`, or `silent`ly wrong; lio_campaign/judge.py says what these mean.
@@ -33,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))  # a spawned process kn
 
 from lio_campaign.draws import draw_kinds
 from lio_campaign.real import why_not
-from lio_campaign.report import describe, report
+from lio_campaign.report import against, describe, report
 from lio_campaign.run import run_real, run_seed
 
 _SMALL, _NIGHTLY = 40, 1000
@@ -44,9 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
     options = _parse(arguments)
     if options.merge:
-        lines = [json.loads(row) for path in options.merge for row in path.read_text(encoding="utf-8").splitlines()]
-        chosen = [line for line in lines if all(line[key] == value for key, value in options.only)]
-        print(report(sorted(chosen, key=lambda line: line["seed"])))
+        earlier = [line for path in options.merge for line in _read(path)]
+        chosen = [line for line in earlier if all(line[key] == value for key, value in options.only)]
+        _report(chosen, options.against)
         return
     work = _work(options)
     if isinstance(work, str):
@@ -63,7 +64,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(json.dumps(line, indent=1), flush=True)
         else:
             print(f"[{len(lines)}/{len(work[1])}] {describe(line)}", flush=True)
-    print(report(sorted(lines, key=lambda line: line["seed"])))
+    _report(lines, options.against)
+
+
+def _report(lines: Sequence[dict[str, Any]], before: Path | None) -> None:
+    lines = sorted(lines, key=lambda line: line["seed"])
+    print(report(lines))
+    if before is not None:
+        print(against(lines, _read(before)))
+
+
+def _read(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(row) for row in path.read_text(encoding="utf-8").splitlines()]
 
 
 Run = Callable[[int], dict[str, Any]]
@@ -112,6 +124,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--real", type=int, metavar="N", help="N recordings with a real IMU and motion, from the first seed on")
     parser.add_argument("--rough", action="store_true", help="with rain, people, lost packets and the like")
     parser.add_argument("--fast", action="store_true", help="on roads, at up to 33 m/s; not with --real")
+    parser.add_argument("--against", type=Path, metavar="FILE", help="earlier lines of the same seeds: what ended otherwise")
     parser.add_argument("--shared", type=Path, default=_SHARED, help="folder with tools/make_lio_recording.py and data/imu")
     parser.add_argument("--out", type=Path, help="append one JSON line a run")
     parser.add_argument("--merge", type=Path, nargs="+", help="only tables, of these JSON lines")

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from boxplus.filtering.nav_state import TANGENT
-from boxplus.formats.trajectory import Trajectory
+from boxplus.formats.trajectory import Trajectory, read_trajectory
+from boxplus.formats.trajectory_writer import write_trajectory
 from boxplus.manifolds import quaternion, so3
 from boxplus.recordings import RecordingOptions, open_recording
 from boxplus.sensors.imu import ImuSamples
@@ -297,6 +298,33 @@ def test_a_sound_run_from_seed_to_report(campaign: SimpleNamespace, seed: int, m
     assert f"python benchmarks/campaign.py --seeds {seed}:{seed + 1} -v" in text
 
 
+def test_a_report_says_which_bars_were_met_and_what_ended_otherwise(campaign: SimpleNamespace) -> None:
+    script = importlib.import_module("campaign")
+    try:
+        drawn = script._crashed(3, ValueError(), script._parse([]))
+    finally:
+        del sys.modules["campaign"]
+    figures = {"verdict": "right", "way_m": 9.0, "worst_m": 0.02, "worst_deg": 0.1, "worst_sigmas": 1.0, "nees": 1.0, "flags": []}
+    sound = [drawn | figures | {"seed": seed, "fault": "none"} for seed in range(1, 21, 2)]
+    faulty = [drawn | figures | {"seed": seed, "fault": "accel_sign", "verdict": "right cause"} for seed in range(21, 41, 2)]
+    text = campaign.report.report([*sound, *faulty])
+    assert text.count(", met") == 3 and "NOT MET" not in text
+    sound[0] |= {"verdict": "silent", "reasons": ["error"]}
+    sound[1] |= {"verdict": "flagged", "false_alarm": "flagged"}
+    for line in faulty[:2]:
+        line["verdict"] = "flagged"
+    text = campaign.report.report([*sound, *faulty])
+    assert "silently wrong or crashed: 1 of 20, NOT MET" in text
+    assert "of the faulty runs that are not right: 80.0%, NOT MET" in text
+    assert "of the sound runs a false alarm: 10.0%, NOT MET" in text
+    now = [line | {"worst_m": 0.041} for line in sound[2:]] + [line | {"verdict": "silent"} for line in faulty[:1]]
+    compared = campaign.report.against([*now, now[0] | {"seed": 99}], [*sound, *faulty])
+    assert compared.startswith(
+        "== against 9 earlier runs of the same recordings: 1 ended otherwise ==\nwas flagged,    21 silent"
+    )
+    assert compared.endswith("8 sound runs right before and now: 0 better, 8 worse, largest errors 2.00 times theirs")
+
+
 def test_the_truth_of_a_real_flight_is_interpolated_smoothly(campaign: SimpleNamespace, seed: int, tmp_path: Path) -> None:
     simulation = replace(campaign.draws.draw(seed), duration_s=3.0).truth()
     write_recording(simulation, tmp_path / "flight", "ros1")
@@ -305,6 +333,24 @@ def test_the_truth_of_a_real_flight_is_interpolated_smoothly(campaign: SimpleNam
     exact, found = simulation.ground_truth(times), truth.ground_truth(times)
     assert np.abs(found.p_world_imu - exact.p_world_imu).max() < 1e-4
     assert np.rad2deg(np.linalg.norm(so3.boxminus(found.R_world_imu, exact.R_world_imu), axis=1)).max() < 0.01
+    assert len(truth.jumps_ns) == 0
+
+
+def test_no_covariance_is_blamed_for_a_ground_truth_that_jumps(campaign: SimpleNamespace, seed: int, tmp_path: Path) -> None:
+    simulation = replace(campaign.draws.draw(seed), duration_s=5.0).truth()
+    write_recording(simulation, tmp_path / "flight", "ros1")
+    path = tmp_path / "flight.gt.tum"
+    poses = read_trajectory(path, "tum")
+    half = len(poses.p) // 2
+    write_trajectory(replace(poses, p=poses.p + 0.04 * (np.arange(len(poses.p)) >= half)[:, None] * [0.0, 1.0, 0.0]), path, "tum")
+    truth = campaign.real.RecordedTruth(path)
+    assert len(truth.jumps_ns) and np.ptp(truth.jumps_ns) <= 20_000_000
+    estimate, judge = estimate_of(simulation), campaign.judge
+    assert judge.errors_of(estimate, truth).too_sure[-1]
+    errors = judge.errors_of(estimate, truth, truth.jumps_ns)
+    since_s = (estimate.time_ns - truth.jumps_ns[0]) * 1e-9
+    np.testing.assert_array_equal(errors.jumped, (since_s >= 0.0) & (since_s < 2.02))
+    np.testing.assert_array_equal(errors.too_sure, since_s >= 2.02)
 
 
 def test_a_real_recording_is_spoilt_after_its_reader(campaign: SimpleNamespace, seed: int, tmp_path: Path) -> None:

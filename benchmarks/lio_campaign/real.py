@@ -32,6 +32,7 @@ _FLIGHTS = {"V1_03_difficult": 104.0, "MH_05_difficult": 110.0}
 """Sequences with the seconds of them that may be used."""
 _SENSORS = {"velodyne": (-15.0, 15.0), "ouster": (-22.5, 22.5), "livox": (0.0, 0.0)}
 """Sensors with the elevations of their lowest and highest ring [deg]; a Livox has none."""
+_JUMP_M = 0.005
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,13 @@ class RealDraw:
 
 
 class RecordedTruth:
-    """Smooth interpolation of the ground truth's poses, which lie 10 ms apart."""
+    """Smooth interpolation of the ground truth's poses, which lie 10 ms apart.
+
+    Attributes:
+        start_ns, end_ns: its first and last time.
+        jumps_ns: (J,) where a step differs from those before and after it, as no flight does: the ground truth of MH_05 does so
+            a dozen times, by up to 5 cm.
+    """
 
     def __init__(self, path: Path) -> None:
         poses = read_trajectory(path, "tum")
@@ -71,6 +78,9 @@ class RecordedTruth:
         self.start_ns, self.end_ns = int(poses.time_ns[0]), int(poses.time_ns[-1])
         time_s = (poses.time_ns - self.start_ns) * 1e-9
         self._p = CubicSpline(time_s, poses.p)
+        v = np.diff(poses.p, axis=0) / np.diff(time_s)[:, None]
+        odd = np.linalg.norm(v[1:-1] - 0.5 * (v[:-2] + v[2:]), axis=1) * np.diff(time_s)[1:-1] > _JUMP_M
+        self.jumps_ns = poses.time_ns[1:-2][odd]
         self._R = RotationSpline(time_s, Rotation.from_quat(poses.q_wxyz[:, [1, 2, 3, 0]]))
 
     def ground_truth(self, time_ns: NDArray[np.int64]) -> Motion:

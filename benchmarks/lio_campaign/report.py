@@ -10,6 +10,8 @@ import numpy as np
 
 VERDICTS = ("right", "right cause", "flagged", "silent", "crashed")
 _KINDS = ("world", "motion", "sensor", "imu", "extrinsic", "fault", "bag", "nuisance")
+_NAMED, _ALARMS = 0.9, 0.01
+_ALIKE = 0.1  # two results whose errors are within this share of one another
 Line = dict[str, Any]
 
 
@@ -22,6 +24,28 @@ def report(lines: Sequence[Line]) -> str:
             parts += [f"== {name}: {len(mine)} runs ==", _summary(mine), *(_table(mine, kind) for kind in _KINDS)]
     parts += [_cases(lines, "silent", "silently wrong"), _cases(lines, "crashed", "crashed"), _alarms(lines)]
     return "\n".join(part for part in parts if part)
+
+
+def against(lines: Sequence[Line], before: Sequence[Line]) -> str:
+    """Runs beside earlier ones of the same recordings: whose verdict changed, and how the errors of sound right ones did."""
+    earlier = {_recording(line): line for line in before}
+    pairs = [(earlier[_recording(line)], line) for line in lines if _recording(line) in earlier]
+    changed = [(old, new) for old, new in pairs if (old["verdict"], old["false_alarm"]) != (new["verdict"], new["false_alarm"])]
+    rows = [f"== against {len(pairs)} earlier runs of the same recordings: {len(changed)} ended otherwise =="]
+    rows += [f"was {old['verdict']}{' FALSE ALARM' if old['false_alarm'] else ''}, {describe(new)}" for old, new in changed]
+    both = [pair for pair in pairs if all(line["fault"] == "none" and line["verdict"] == "right" for line in pair)]
+    if both:
+        ratios = np.array([(new["worst_m"] + 1e-3) / (old["worst_m"] + 1e-3) for old, new in both])
+        better, worse = int(np.sum(ratios < 1.0 - _ALIKE)), int(np.sum(ratios > 1.0 + _ALIKE))
+        mean = float(np.exp(np.log(ratios).mean()))
+        rows.append(
+            f"{len(both)} sound runs right before and now: {better} better, {worse} worse, largest errors {mean:.2f} times theirs"
+        )
+    return "\n".join(rows)
+
+
+def _recording(line: Line) -> tuple[Any, ...]:
+    return tuple(line[key] for key in ("seed", "real", "rough", "fast"))
 
 
 def _summary(lines: Sequence[Line]) -> str:
@@ -39,7 +63,27 @@ def _summary(lines: Sequence[Line]) -> str:
         texts.append(f"sound, NEES a degree of freedom (1 is consistent): median {median:.2f}, 95 % {high:.2f}")
     cpu = [line["cpu_s"] for line in lines]
     texts.append(f"processor time a run: median {np.median(cpu):.1f} s, most {max(cpu):.1f} s")
-    return "\n".join(texts)
+    return "\n".join([*texts, *_bars(lines, sound, faulty)])
+
+
+def _bars(lines: Sequence[Line], sound: Sequence[Line], faulty: Sequence[Line]) -> list[str]:
+    """What a campaign has to reach, and whether it did. A fault that left a run right needs no name."""
+    silent = sum(line["verdict"] in ("silent", "crashed") for line in lines)
+    texts = [f"bar: none silently wrong or crashed: {silent} of {len(lines)}, {_met(silent == 0)}"]
+    wrong = [line for line in faulty if line["verdict"] != "right"]
+    if wrong:
+        named = sum(line["verdict"] == "right cause" for line in wrong) / len(wrong)
+        texts.append(
+            f"bar: the cause named in {_NAMED:.0%} of the faulty runs that are not right: {named:.1%}, {_met(named >= _NAMED)}"
+        )
+    if sound:
+        alarms = sum(bool(line["false_alarm"]) for line in sound) / len(sound)
+        texts.append(f"bar: at most {_ALARMS:.0%} of the sound runs a false alarm: {alarms:.1%}, {_met(alarms <= _ALARMS)}")
+    return texts
+
+
+def _met(met: bool) -> str:
+    return "met" if met else "NOT MET"
 
 
 def _counts(name: str, lines: Sequence[Line]) -> str:

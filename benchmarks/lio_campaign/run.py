@@ -29,9 +29,9 @@ from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.simulation import Fault, Simulation, as_recording, write_recording
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from lio_campaign.draws import Draw, draw
-from lio_campaign.judge import Drawn, Errors, Outcome, Truth, errors_of, judge
+from lio_campaign.judge import NO_JUMPS, Drawn, Errors, Outcome, Truth, errors_of, judge
 from lio_campaign.nuisances import Scene, draw_nuisances
-from lio_campaign.real import RealDraw, draw_real, opened_real
+from lio_campaign.real import RealDraw, RecordedTruth, draw_real, opened_real
 from lio_campaign.traffic import traffic
 
 _AnyDraw = TypeVar("_AnyDraw", Draw, RealDraw)
@@ -116,7 +116,8 @@ def _looked_at(made: Drawn) -> bool:
 
 
 def _judged(made: Drawn, outcome: Outcome, truth: Truth, suspects: list[dict[str, float]]) -> dict[str, Any]:
-    errors = None if outcome.estimate is None else errors_of(outcome.estimate, truth)
+    jumps_ns = truth.jumps_ns if isinstance(truth, RecordedTruth) else NO_JUMPS
+    errors = None if outcome.estimate is None else errors_of(outcome.estimate, truth, jumps_ns)
     weak = outcome.estimate is not None and outcome.estimate.status is not None and "weak" in set(outcome.estimate.status)
     verdict = judge(outcome, errors, made, falsely_weak=bool(suspects), truly_weak=weak and _looked_at(made) and not suspects)
     return asdict(verdict) | _figures(errors) | _facts(outcome) | {"falsely_weak_scans": suspects}
