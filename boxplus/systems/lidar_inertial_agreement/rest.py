@@ -87,13 +87,13 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
     creeps = speed < _CREEP_M_S and rate < _CREEP_RAD_S
     at_rest = bool((slow and rate < _SLOW_RAD_S) or (creeps and _fits_unmoved(path, scans, config)))
     open_axes = axes[:, ~seen].T
-    if at_rest and seen.all() and not _faces(path, scans, config, axes[:, 0]):
+    if at_rest and seen.all() and not faces(path, scans, config, axes[:, 0]):
         open_axes = axes[:, :1].T
     return Rest(at_rest, open_axes, not_shown.T, speed, rate)
 
 
-def _faces(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, axis: NDArray[np.float64]) -> bool:
-    """Whether there are surfaces across an axis (3,) that would show a motion along it."""
+def faces(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, axis: NDArray[np.float64]) -> bool:
+    """Whether surfaces across an axis (3,), in the frame of the path's first pose, would show a motion along it."""
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     voxel_filter = VoxelFilter(config.map_cell, _MOST_MAP_POINTS)
     for k, scan in enumerate(scans):

@@ -30,7 +30,7 @@ from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING, Beg
 
 _COMPARED = 3  # pairs of scans, the newest: what moved about may be gone
 _CHANGING = 0.0025  # share of points that change: at rest none, of a rosette up to 0.0022; on drives 0.0024 and more
-_RESTING_M_S = 0.5  # slower, a path may be one of rest
+RESTING_M_S = 0.5  # slower, a path may be one of rest
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ def following_changes(seen: Beginning, path: LidarPath) -> Common | None:
     held = held_path(seen, seen.guesses, motion.twists())
     shown = found and one_speed(path, held)
     if motion.doubt:
-        rests = found and float(np.linalg.norm(mean_velocity(path))) < _RESTING_M_S
+        rests = found and float(np.linalg.norm(mean_velocity(path))) < RESTING_M_S
         if shown or (rests and motion.may_rest and seen.waited_long):  # the path is asked on its own
             return None
         raise NotYet(f"the surroundings do not show how fast the platform moves ({seen.evidence}): {motion.doubt}{WAITING}")

@@ -18,17 +18,20 @@ from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import speaks_against
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
+    least_known_axis,
     mean_velocity,
     one_speed,
     other_speed,
+    well_known,
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns, turned_by_gyroscope
-from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
+from boxplus.systems.lidar_inertial_agreement.rest import Rest, faces, judge_rest
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING, Beginning, NotYet, broken
 from boxplus.systems.lidar_inertial_odometry.start.changes import (
+    RESTING_M_S,
     Common,
     following_changes,
     held_path,
@@ -234,6 +237,8 @@ def _moving_start(seen: Beginning, path: LidarPath, motion: Common | None = None
             f"{np.degrees(np.linalg.norm(drift[:3])):.1f} deg off where its first ones want it (few rings, a repeating pattern, "
             "foliage, or moving things)"
         )
+    if not follow:
+        _check_slowness(seen, path)
     not_shown = shown_turns(path)[1]
     if seen.config.extrinsic_estimation == "off":  # it is known how the gyroscope lies: it shows what the surroundings do not
         path = turned_by_gyroscope(path, imu, seen.extrinsic.R_imu_lidar, gyro_bias(path, imu, seen.extrinsic))
@@ -258,6 +263,18 @@ def _moving_start(seen: Beginning, path: LidarPath, motion: Common | None = None
         raise seen.not_moving(f"the surroundings do not show how fast the platform moves: {doubt}")
     text = f"moving at {speed:.2f} ± {sigma:.2f} m/s: {seen.evidence}; {misfit}"
     return Start("moving", scans[0].end_ns, state, covariance, seen.duration_s, text)
+
+
+def _check_slowness(seen: Beginning, path: LidarPath) -> None:
+    """Whether something faces the axis that is known least, where the path hardly moves along it.
+
+    Along a smooth tunnel a path stays where it is, however fast the platform drives, and creeps where others overtake it.
+    """
+    axes = seen.level(least_known_axis(path)[None])
+    if not len(axes) or well_known(path) or abs(float(axes[0] @ mean_velocity(path))) > RESTING_M_S:
+        return
+    if not faces(path, seen.scans, seen.registration, axes[0]):
+        raise seen.not_moving(undecided(axes))
 
 
 def _checked_fit(seen: Beginning, path: LidarPath) -> TranslationFit:

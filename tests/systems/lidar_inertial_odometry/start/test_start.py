@@ -19,7 +19,9 @@ from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, si
 from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import sites
 from boxplus.simulation.worlds.world import World, box
+from boxplus.systems.lidar_inertial_agreement.rest import Rest
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from boxplus.systems.lidar_inertial_odometry.start import start as start_module
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start
 from tests.systems.lidar_inertial_odometry.small_drives import LIDAR, before_a_wall, config, frames, room_walk, run, turning_by
 
@@ -169,6 +171,18 @@ def test_a_shaken_drive_whose_way_is_open_is_no_start_at_no_speed() -> None:
     said, refused = found[1.0], found[6.0]
     assert isinstance(said, Start) and len(said.unshown_axes) == 1 and "taken as at rest" in said.warning
     assert isinstance(refused, str) and "whether the platform moves along (" in refused
+
+
+@pytest.mark.slow
+def test_a_path_that_creeps_along_a_smooth_tunnel_is_no_start_in_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it does where others overtake: nothing faces the way, so that it stays where it is at any speed."""
+    drive = manoeuvres.constant_velocity(3.0, (0.0, 0.2, 1.8), (20.0, 0.0, 0.0), np.eye(3))
+    imu = ImuModel(accel_vibration=0.9, gyro_vibration=0.02, vibration_hz=60.0)
+    simulation = Simulation(Scenario("tunnel", sites.tunnel(600.0), drive, LIDAR, imu, np.eye(4)), 5, 1.2)
+    creeping = Rest(False, np.zeros((0, 3)), np.zeros((0, 3)), 0.033, 0.0)
+    monkeypatch.setattr(start_module, "judge_rest", lambda *_: creeping)
+    refused = find_start(frames(simulation.events()), config(simulation))
+    assert isinstance(refused, str) and "the surroundings do not show whether the platform moves along (" in refused
 
 
 @pytest.mark.slow
