@@ -54,11 +54,23 @@ def frames(events: Iterable[Scan | ImuSamples]) -> list[Frame]:
 
 def position_errors(simulation: Simulation, estimates: list[Estimate]) -> np.ndarray:
     """Distances (N,) from the truth, with the first estimate laid on it (heading and position) [m]."""
+    errors: np.ndarray = np.linalg.norm(_errors_world(simulation, estimates), axis=1)
+    return errors
+
+
+def deviations(simulation: Simulation, estimates: list[Estimate]) -> np.ndarray:
+    """The same distances (N,) in standard deviations of the stated covariance along the error; 0 at the first, the datum."""
+    errors = _errors_world(simulation, estimates)[1:]
+    P = np.array([estimate.pose_covariance[3:, 3:] for estimate in estimates[1:]])
+    return np.concatenate([[0.0], np.sqrt(np.einsum("ni,ni->n", errors, np.linalg.solve(P, errors[:, :, None])[:, :, 0]))])
+
+
+def _errors_world(simulation: Simulation, estimates: list[Estimate]) -> np.ndarray:
+    """(N, 3) in the world of the estimates [m]."""
     truth = simulation.ground_truth(np.array([e.time_ns for e in estimates]))
-    R_align = truth.R_world_imu[0] @ estimates[0].state.R_world_imu.T
+    R_align = estimates[0].state.R_world_imu @ truth.R_world_imu[0].T
     p = np.stack([e.state.p_world_imu for e in estimates])
-    moved = (p - p[0]) @ R_align.T + truth.p_world_imu[0]
-    errors: np.ndarray = np.linalg.norm(moved - truth.p_world_imu, axis=1)
+    errors: np.ndarray = p - p[0] - (truth.p_world_imu - truth.p_world_imu[0]) @ R_align.T
     return errors
 
 
