@@ -5,6 +5,7 @@ Derivation: docs/lidar_inertial_odometry.md, section 10.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,8 @@ from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, simulate
 from boxplus.simulation.motions import manoeuvres, trajectories
-from boxplus.simulation.worlds import sites
+from boxplus.simulation.motions.spline import Trajectory
+from boxplus.simulation.worlds import sites, worlds
 from boxplus.simulation.worlds.world import World, box
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
@@ -235,6 +237,35 @@ def test_too_few_scans_in_motion_are_refused_with_the_evidence() -> None:
     assert isinstance(refusal, str)
     assert refusal.startswith("not at rest (gyro std ")
     assert refusal.endswith("and 4 scans are not enough for a moving start; waiting for more data")
+
+
+def _steady(motion: Trajectory, imu: ImuModel | None = None) -> Simulation:
+    return Simulation(Scenario("steady", worlds.room((24.0, 20.0, 5.0)), motion, LIDAR, imu or ImuModel()), 0, 1.4)
+
+
+def test_an_accelerometer_that_does_not_show_how_the_lidar_swings_is_refused() -> None:
+    """The LiDAR swings by half a metre, and the IMU is that of a platform at rest; with its own, the same scans are a start."""
+    centre = np.array([-3.0, -2.0, 1.5])
+    swinging = _steady(manoeuvres.handheld(2.0, centre - 0.25, centre + 0.25, 2.0, 0.05, standstill_s=0.0))
+    other = _steady(trajectories.at_rest(2.0, tuple(centre)))
+    scans = [event for event in swinging.events() if isinstance(event, Scan)]
+    refusal = find_start(frames([*(e for e in other.events() if isinstance(e, ImuSamples)), *scans]), config(swinging))
+    assert isinstance(refusal, str)
+    named = re.search(r", and LiDAR and IMU do not fit better than (\d+\.\d) cm; waiting for more data$", refusal)
+    assert named is not None and 5.0 < float(named[1]) < 50.0
+    sound = find_start(frames(swinging.events()), config(swinging))
+    assert isinstance(sound, Start) and sound.kind == "moving"
+
+
+@pytest.mark.parametrize(("bias", "starts"), [(0.2, True), (1.0, False)])
+def test_a_moving_start_that_asks_for_a_bias_that_no_accelerometer_in_order_has_is_refused(bias: float, starts: bool) -> None:
+    motion = manoeuvres.constant_velocity(2.0, (-5.0, -2.0, 1.5), (1.2, 0.0, 0.0), np.eye(3))
+    simulation = _steady(motion, ImuModel(accel_bias=(0.0, 0.0, bias)))
+    found = find_start(frames(simulation.events()), config(simulation))
+    assert isinstance(found, Start) == starts
+    if isinstance(found, str):
+        named = re.search(r"the path of the LiDAR asks for a bias of the accelerometer of (\d\.\d\d) m/s²", found)
+        assert named is not None and 0.4 < float(named[1]) < 1.1
 
 
 def test_scans_that_do_not_overlap_are_refused() -> None:
