@@ -5,17 +5,18 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+import pytest
 
 from boxplus.filtering.degeneracy import pose_directions
 from boxplus.filtering.iterated_update import Information, Posterior
 from boxplus.filtering.nav_state import T_P, T_V, TANGENT
-from boxplus.simulation import Scenario, Simulation
-from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation import ImuModel, Scenario, Simulation
+from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
-from tests.systems.lidar_inertial_odometry.small_drives import LIDAR, config, run
+from tests.systems.lidar_inertial_odometry.small_drives import LIDAR, config, deviations, position_errors, run
 
 AXIS = np.array([1.0, 0.0, 0.0])
 CELL_M = 0.25
@@ -61,6 +62,19 @@ def test_a_constant_speed_in_a_corridor_is_never_claimed_to_be_rest() -> None:
         assert error @ np.linalg.solve(P, error) < 5.0**2
         assert np.sqrt(estimate.covariance[T_V, T_V]) > 5.0
     assert np.linalg.norm(error) > 5.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_a_shaken_platform_at_rest_in_a_corridor_does_not_run_away(seed: int) -> None:
+    """Motors shake it with 1 m/s²: it stays where it is, and says all the time that nothing shows it along the corridor."""
+    motion, imu = trajectories.at_rest(9.0, (-5.0, 0.1, 1.4)), ImuModel(accel_vibration=1.0, gyro_vibration=0.05)
+    simulation = Simulation(Scenario("corridor", worlds.corridor(), motion, LIDAR, imu), seed, 8.0)
+    odometry = LidarInertialOdometry(config(simulation))
+    estimates = run(odometry, simulation.events())
+    assert odometry.start is not None and odometry.start.kind == "static" and odometry.contradiction is None
+    assert {estimate.status for estimate in estimates[1:]} == {"weak"}
+    assert position_errors(simulation, estimates).max() < 0.05 and (deviations(simulation, estimates) < 5.0).all()
 
 
 def test_what_is_not_known_grows_with_time_along_the_axis() -> None:
