@@ -1,18 +1,22 @@
-"""A pose that fits a part of what it sees and misses the rest is contradicted within about a second."""
+"""What the scans say against the estimate, scan by scan, and how long it takes to be said."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from boxplus.filtering.nav_state import BA, BW, T_P, TANGENT, NavState, P
+from boxplus.filtering.nav_state import BA, BW, T_P, TANGENT, NavState, P, V
+from boxplus.manifolds import so3
+from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
 
 PERIOD_NS = 100_000_000
+ABOUT_Z, ALONG_X = np.eye(6)[2], np.eye(6)[T_P]
 
 
 def follow(shares: list[float]) -> tuple[Consistency, list[str]]:
@@ -63,17 +67,82 @@ def test_a_bias_that_changes_by_more_than_any_sensor_does_is_a_contradiction(
     assert len(told) == (max(first, then) > 0.7)
 
 
+def innovate(
+    corrections: list[np.ndarray], samples: int = 10, weak: tuple[int, ...] = (), v: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> tuple[Consistency, list[list[str]]]:
+    """Corrections of the pose (6,), a scan each at 10 Hz, of a prediction that is good for 0.1 mm."""
+    consistency, found = Consistency(LioConfig()), []
+    directions = SimpleNamespace(weak=np.isin(np.arange(6), weak), vectors=np.eye(6), lever_arm=10.0)
+    for number, pose in enumerate(corrections):
+        correction = np.concatenate([pose, np.zeros(TANGENT - 6)])
+        x = NavState.identity().pack()
+        x[P : P + 3], x[V : V + 3] = pose[T_P : T_P + 3], v
+        posterior: Any = SimpleNamespace(x=x, valid=True, last=SimpleNamespace(directions=directions))
+        frame: Any = SimpleNamespace(scan=SimpleNamespace(end_ns=number * PERIOD_NS), imu=range(samples))
+        found.append(consistency._innovate(frame, correction, 1e-8 * np.eye(TANGENT), posterior))
+    return consistency, found
+
+
 @pytest.mark.parametrize(("off_m", "samples", "told"), [(0.02, 10, 1), (0.005, 10, 0), (0.02, 1, 0)])
 def test_corrections_beyond_noise_are_named_once_after_two_seconds(off_m: float, samples: int, told: int) -> None:
     """2 cm a scan, where the prediction and a registration are good for 1 cm; with one IMU sample a scan nobody knows."""
-    x, correction = NavState.identity().pack(), np.zeros(TANGENT)
-    x[P] += off_m
-    correction[T_P] = off_m
-    directions = SimpleNamespace(weak=np.zeros(6, bool), vectors=np.eye(6), lever_arm=1.0)
-    posterior: Any = SimpleNamespace(x=x, valid=True, last=SimpleNamespace(directions=directions))
-    consistency, found = Consistency(LioConfig()), []
-    for number in range(40):
-        frame: Any = SimpleNamespace(scan=SimpleNamespace(end_ns=number * PERIOD_NS), imu=range(samples))
-        found.append(consistency._innovate(frame, correction, 1e-8 * np.eye(TANGENT), posterior))
+    consistency, found = innovate([off_m * ALONG_X] * 40, samples)
     assert sum(map(len, found)) == told and consistency.contradiction is None
     assert not any(found[:20])
+
+
+@pytest.mark.parametrize("off", [0.08 * ALONG_X, 0.008 * ABOUT_Z], ids=["8 cm", "half a degree"])
+def test_what_the_lidar_corrects_scan_after_scan_is_a_contradiction_within_a_second_and_a_half(off: np.ndarray) -> None:
+    """By eight standard deviations of a registration, whether it is a way or a turn."""
+    consistency, found = innovate([np.zeros(6)] * 5 + [off] * 30 + [np.zeros(6)] * 5)
+    scans = [number for number, texts in enumerate(found, -5) if any("contradicted what the IMU predicts" in t for t in texts)]
+    assert len(scans) == 1 and 1.0 <= scans[0] * PERIOD_NS * 1e-9 <= 1.5
+    assert str(consistency.contradiction).startswith("for 1.0 s the LiDAR has contradicted what the IMU predicts, scan after")
+
+
+@pytest.mark.parametrize("off", [0.08 * ALONG_X, 0.008 * ABOUT_Z])
+def test_a_few_scans_apart_or_along_what_they_do_not_show_are_no_contradiction(off: np.ndarray) -> None:
+    """A bump that the IMU missed is over at once; along a direction that the scan does not show nothing is measured."""
+    assert innovate(([off] * 3 + [np.zeros(6)] * 17) * 3)[0].contradiction is None
+    assert innovate([off] * 40, weak=(2, 3))[0].contradiction is None
+    assert innovate([off] * 40, weak=(0, 4))[0].contradiction is not None
+
+
+def test_a_speed_that_no_platform_has_is_a_contradiction_at_once() -> None:
+    for speed, contradicted in ((110.0, False), (130.0, True)):
+        consistency, found = innovate([np.zeros(6)] * 5, v=(0.0, 0.8 * speed, -0.6 * speed))
+        assert (consistency.contradiction is not None) == contradicted
+        assert [len(texts) for texts in found] == [int(contradicted), 0, 0, 0, 0]
+        assert not contradicted or found[0][0].startswith("the estimate moves at 130 m/s")
+
+
+@pytest.mark.parametrize(("by_gyroscope", "by_lidar", "suspicious"), [(0.0, 2.0, True), (2.0, 0.0, True), (2.0, 2.0, False)])
+def test_whichever_sensor_turns_alone_raises_a_suspicion(by_gyroscope: float, by_lidar: float, suspicious: bool) -> None:
+    """In degrees a scan: a gyroscope that claims not to turn is as wrong as one that turns alone.
+
+    Nothing else speaks against it: the prediction is taken to be good for next to nothing.
+    """
+    consistency, seen = Consistency(LioConfig()), []
+
+    def add(*_: object, suspicious: bool, **__: object) -> None:
+        seen.append(suspicious)
+
+    consistency._watch = SimpleNamespace(add=add, contradiction=None, mounting_borne_out=True)  # type: ignore[assignment]
+    time_ns = np.linspace(0, PERIOD_NS, 20).astype(np.int64)
+    directions = SimpleNamespace(weak=np.zeros(6, bool), vectors=np.eye(6), lever_arm=1.0)
+    cov = np.eye(TANGENT)
+    B = np.zeros((TANGENT, 6))
+    for number in range(30):
+        x_before, x_prior, x = (
+            replace(NavState.identity(), R_world_imu=so3.exp(np.radians([0.0, 0.0, turned]))).pack()
+            for turned in (0.0, by_gyroscope, by_lidar)
+        )
+        begin_ns = number * PERIOD_NS
+        imu = ImuSamples(begin_ns + time_ns, np.zeros((20, 3)), np.tile([0.0, 0.0, 9.81], (20, 1)))
+        frame: Any = SimpleNamespace(
+            scan=SimpleNamespace(start_ns=begin_ns, end_ns=begin_ns + PERIOD_NS), imu=imu, duration_s=0.1, largest_gap_s=0.005
+        )
+        posterior = SimpleNamespace(x=x, cov=cov, valid=True, last=SimpleNamespace(directions=directions))
+        update: Any = SimpleNamespace(posterior=posterior, cov_prior=cov, cov=cov, B=B, B_prior=B)
+        consistency.update(frame, x_before, x_prior, update, 1.0, 1.0)
+    assert seen[-1] == suspicious
