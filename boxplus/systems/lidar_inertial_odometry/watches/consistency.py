@@ -24,6 +24,7 @@ from boxplus.systems.lidar_inertial_odometry.mounted_update import MountedUpdate
 from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem
 from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
 from boxplus.systems.lidar_inertial_odometry.watches.steady_bias import SteadyBias
+from boxplus.systems.lidar_inertial_odometry.watches.stuck_sensor import StuckSensor
 
 _KEEP = 0.96  # of the sums of rotations, from scan to scan
 _LEAST_TURN = 20.0 * 0.005**2  # rad², of the faded sum: below it no ratio means anything
@@ -79,6 +80,7 @@ class Consistency:
         self._previous_start_ns: int | None = None
         self._first_biases: NDArray[np.float64] | None = None
         self._steady, self._corrections = SteadyBias(config.gyro_bias_walk), Corrections()
+        self._stuck = StuckSensor()
         self._corrected_from_ns: int | None = None
         self._told: set[str] = set()
 
@@ -128,7 +130,7 @@ class Consistency:
         self._corrected = _KEEP * self._corrected + float(corrected @ corrected)
         correction = np.zeros(TANGENT)
         boxminus_into(x, x_prior, correction)
-        warnings = self._span(frame)
+        warnings = self._span(frame) + self._contradicting("stuck", self._stuck.update(frame.imu))
         warnings += self._innovate(frame, correction, update.cov_prior, posterior)
         warnings += self._fit(frame, fitting_share)
         warnings += self._biases(x, posterior.cov)
