@@ -2,7 +2,8 @@
 
 To the filter such a sensor is the best there is, and a platform that seems not to turn drags its map along. Values that are
 the same sample after sample are nothing by themselves: at rest a coarse sensor rounds its noise away. They are where the other
-sensor moves, or where the last ones before were far from them, as nothing stops within a sample.
+sensor moves, or where the last ones before were far from them, as nothing stops within a sample. That is said of an IMU with
+noise in the other sensor only: without any it is simulated, and a straight way is a straight way.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ _BEFORE, _PARTS = 4, 5  # samples before; parts over whose means vibration is go
 _SENSORS = (("gyroscope", slice(0, 3)), ("accelerometer", slice(3, 6)))
 _MOVING = {"gyroscope": 0.1, "accelerometer": 0.2}  # rad/s, m/s²: by which means over a tenth of a second differ at no rest
 _STEP = {"gyroscope": 0.1, "accelerometer": 1.0}
+_NOISE = {"gyroscope": 2e-4, "accelerometer": 2e-3}  # second differences that no smooth motion has; real IMUs ten times
 
 
 class StuckSensor:
@@ -41,9 +43,12 @@ class StuckSensor:
             seconds = float(self._time_ns[-1] - self._time_ns[begin]) * 1e-9
             if seconds < _STUCK_S or len(self._values) - begin < _FEWEST:
                 continue
+            others = self._values[begin:, other_axes]
+            if np.abs(np.diff(others, 2, axis=0)).mean() < _NOISE[other]:
+                continue
             before, stuck = self._values[max(begin - _BEFORE, 0) : begin, axes], self._values[-1, axes]
             stepped = len(before) > 0 and float(np.linalg.norm(before.mean(axis=0) - stuck)) > _STEP[name]
-            if stepped or _varies(self._values[begin:, other_axes]) > _MOVING[other]:
+            if stepped or _varies(others) > _MOVING[other]:
                 return (
                     f"for {seconds:.1f} s the {name} has given the same values sample after sample although the platform moves: "
                     "it has failed, or its driver repeats what it had last"

@@ -83,6 +83,14 @@ def test_coarse_samples_at_rest_are_nothing(vibration: float) -> None:
     assert not told(gyro, accel)
 
 
+def test_a_simulated_imu_without_noise_may_drive_straight_on() -> None:
+    time = np.arange(600) / RATE_HZ
+    gyro = np.where(time[:, None] < 1.0, [0.0, 0.0, 0.5], 0.0)
+    accel = np.array([0.0, 0.0, 9.81]) + np.sin(np.pi * time)[:, None] * [1.0, 0.0, 0.0]
+    assert not told(gyro, accel)
+    assert told(gyro, accel + 0.01 * np.random.default_rng(0).normal(size=accel.shape))
+
+
 @pytest.mark.parametrize("held", [2, 10])
 def test_values_held_until_the_next_arrives_are_nothing(held: int) -> None:
     """A driver that gives what a slower sensor had last, again and again."""
