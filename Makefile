@@ -54,7 +54,7 @@ $(VENV)/.runtime: pyproject.toml $(VENV)/.python
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.python
 	@echo "installing boxplus and the tools for its tests into $(VENV) (once; about a minute)"
-	@$(PIP) install -e '.[dev,vision]'
+	@$(PIP) install -e '.[dev,vision,fleet]'
 	@touch $(VENV)/.runtime $@
 
 $(VENV)/.docs: pyproject.toml $(VENV)/.python
