@@ -20,6 +20,10 @@ READ_ERRORS: tuple[type[Exception], ...] = (
 """What decoders raise on damaged bytes, their own error classes aside."""
 
 
+class DamagedRecordError(ValueError):
+    """A record is cut off, its header makes no sense, or it inflates to more than any recorder writes."""
+
+
 @dataclass(frozen=True, slots=True)
 class Channel:
     """One topic of a container: its name, its message type without `/msg/`, how its messages are serialised, how many."""
@@ -52,7 +56,8 @@ class Container(Protocol):
 def foreign_errors() -> tuple[type[Exception], ...]:
     """The error classes of the decompressors and of SQLite, which do not derive from the built-in ones above."""
     errors: list[type[Exception]] = []
-    for module, name in (("backports.zstd", "ZstdError"), ("zstandard", "ZstdError"), ("apsw", "Error"), ("sqlite3", "Error")):
+    zstd = [(module, "ZstdError") for module in ("compression.zstd", "backports.zstd", "zstandard")]
+    for module, name in (*zstd, ("apsw", "Error"), ("sqlite3", "Error")):
         try:
             errors.append(getattr(importlib.import_module(module), name))
         except ImportError:

@@ -7,25 +7,20 @@ some versions of rosbags do not take (ROS 1 messages in MCAP, files without thei
 
 from __future__ import annotations
 
-import bz2
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
-from boxplus.recordings.bags.container import READ_ERRORS, Channel, foreign_errors
+from boxplus.recordings.bags.container import READ_ERRORS, Channel, DamagedRecordError, foreign_errors
+from boxplus.recordings.bags.inflation import inflate
 
 ROS1_MAGIC, _ANY_ROS1_MAGIC = b"#ROSBAG V2.0\n", b"#ROSBAG V"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format"
 _LARGEST_RECORD = 1 << 31
-_LARGEST_CHUNK = 1 << 28
-
-
-class DamagedRecordError(ValueError):
-    """A record is cut off or its header makes no sense."""
 
 
 class _Message(NamedTuple):
@@ -150,7 +145,7 @@ def _scan_ros1(stream: BinaryIO) -> Iterator[_Record | None]:
 
 
 def _ros1_chunk(header: dict[bytes, bytes], data: bytes) -> Iterator[_Record]:
-    chunk = _decompress(header.get(b"compression", b"none").decode(), data)
+    chunk = inflate(header.get(b"compression", b"none").decode(), data)
     position = 0
     while position < len(chunk):
         (length,) = struct.unpack_from("<I", chunk, position)
@@ -211,7 +206,7 @@ def _mcap_chunk(content: bytes, schemas: dict[int, str]) -> Iterator[_Record]:
     compression = content[32 : 32 + name_length].decode()
     (stored,) = struct.unpack_from("<Q", content, 32 + name_length)
     begin = 40 + name_length
-    chunk = _decompress(compression, content[begin : begin + stored])
+    chunk = inflate(compression, content[begin : begin + stored])
     position = 0
     while position < len(chunk):
         operation, length = struct.unpack_from("<BQ", chunk, position)
@@ -256,40 +251,3 @@ def _skipping_damage(records: Iterator[_Record]) -> Iterator[_Record | None]:
         yield from records
     except READ_ERRORS + foreign_errors():
         yield None
-
-
-def _decompress(compression: str, data: bytes) -> bytes:
-    """The content of a chunk; no writer makes chunks anywhere near the limit, which a few kilobytes could otherwise exceed."""
-    if compression in ("none", ""):
-        return data
-    if compression == "bz2":
-        inflated = _inflated(bz2.BZ2Decompressor(), data)
-    elif compression == "lz4":
-        import lz4.frame
-
-        inflated = _inflated(lz4.frame.LZ4FrameDecompressor(), data)
-    elif compression == "zstd":
-        inflated = _inflated_zstd(data)
-    else:
-        raise DamagedRecordError(f"unknown compression {compression!r}")
-    if len(inflated) > _LARGEST_CHUNK:
-        raise DamagedRecordError(f"a chunk of {len(data)} bytes inflates to more than {_LARGEST_CHUNK} bytes")
-    return inflated
-
-
-def _inflated(decompressor: Any, data: bytes) -> bytes:
-    inflated = bytes(decompressor.decompress(data, max_length=_LARGEST_CHUNK + 1))
-    if not decompressor.eof and len(inflated) <= _LARGEST_CHUNK:
-        raise DamagedRecordError("the file is cut off in the middle of a chunk")
-    return inflated
-
-
-def _inflated_zstd(data: bytes) -> bytes:
-    # rosbags brings one of these, depending on its version and on Python's.
-    try:
-        from backports import zstd
-    except ImportError:
-        import zstandard
-
-        return bytes(zstandard.ZstdDecompressor().stream_reader(data).read(_LARGEST_CHUNK + 1))
-    return _inflated(zstd.ZstdDecompressor(), data)

@@ -1,6 +1,5 @@
 """Damaged recordings: what is readable is delivered, the rest is reported, nothing else happens."""
 
-import bz2
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -14,7 +13,6 @@ from typer.testing import CliRunner
 from boxplus.cli import app
 from boxplus.errors import RecordingError
 from boxplus.recordings import Recording, open_recording
-from boxplus.recordings.bags import sequential
 from boxplus.runs.inspection.diagnosis import diagnose
 from boxplus.sensors.scan import Scan
 from tests.bags import CONTAINERS, Content, write_bag
@@ -123,32 +121,6 @@ def test_a_bag_with_nothing_readable_is_refused(tmp_path: Path) -> None:
         path.write_bytes(head)
         with pytest.raises(RecordingError, match=r"a readable ROS bag or MCAP file – got x\.db3: .* nothing in this file"):
             open_recording(path)
-
-
-@pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])
-def test_a_chunk_that_would_fill_the_memory_is_damage(compression: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sequential, "_LARGEST_CHUNK", 1 << 16)
-    for size, fits in ((1 << 16, True), ((1 << 16) + 1, False)):
-        chunk = compressed(compression, bytes(size))
-        if fits:
-            assert sequential._decompress(compression, chunk) == bytes(size)
-            with pytest.raises((ValueError, EOFError, RuntimeError)):
-                sequential._decompress(compression, chunk[:-9])
-        else:
-            with pytest.raises(sequential.DamagedRecordError, match="inflates to more than 65536 bytes"):
-                sequential._decompress(compression, chunk)
-
-
-def compressed(compression: str, data: bytes) -> bytes:
-    if compression == "bz2":
-        return bz2.compress(data)
-    if compression == "lz4":
-        return bytes(pytest.importorskip("lz4.frame").compress(data))
-    try:
-        from backports import zstd
-    except ImportError:
-        return bytes(pytest.importorskip("zstandard").ZstdCompressor().compress(data))
-    return bytes(zstd.compress(data))
 
 
 @pytest.mark.parametrize("definition", ["= = =", "int32[", "a/b/c/d e", "string<=3 x = 'a", "\x00", "float64 x 1\nMSG: y"])
