@@ -9,7 +9,9 @@ import importlib
 import io
 import logging
 import os
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -168,5 +170,7 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):  # a pipe under Windows knows no χ² and no arrow; results are not to end with it
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+    if threading.current_thread() is threading.main_thread():  # SIGTERM as Ctrl-C, also while a command is still imported
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     atexit.register(gc.freeze)  # what is left goes with the process; to look for garbage among it takes a seventh of a second
     app(prog_name="boxplus")
