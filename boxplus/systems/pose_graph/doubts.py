@@ -141,15 +141,17 @@ def poor_fit_sentence(fit: Fit, minima: Mapping[Start, float], fixed: int) -> st
 
 
 def local_notes(fit: Fit, minima: Mapping[Start, float]) -> list[str]:
-    """A sentence where the fit is good, and yet the two best starts ended in different minima."""
+    """A sentence where the fit is good, and yet the best starts ended in different minima."""
     if fit.is_poor or len(minima) < 2 or fit.dof == 0 or not {"chordal", "chordal_objective"} <= minima.keys():
         return []
     first, smooth = minima["chordal"], minima["chordal_objective"]
-    if not abs(first - smooth) > _SAME * min(first, smooth):
+    lowest = min(minima.values())
+    if not max(first, smooth) - lowest > _SAME * lowest:
         return []
+    relaxed = f", a Cauchy loss from the lowest of all starts at {minima['cauchy']:.6g}" if "cauchy" in minima else ""
     return [
         f"the noise in rotation leaves room for local minima that fit: the chordal start ended at χ² {first:.6g}, the minimum of "
-        f"the chordal objective at {smooth:.6g}; the lower is taken, and a lower one may exist"
+        f"the chordal objective at {smooth:.6g}{relaxed}; the lowest is taken, and a lower one may exist"
     ]
 
 

@@ -109,7 +109,7 @@ class PoseGraphResult:
         weights: (m,) weight of every edge at the end, 0 to 1: refused, or silenced by a robust loss.
         fit: χ² of the edges that count against what their information promises.
         checks: how large an error of a single edge has to be to show; None where that was not examined.
-        minima: the objective at the end of every start that was followed; more than one where the residuals did not fit.
+        minima: the objective at the end of every start that was followed; several after a misfit or with noisy rotations.
         loops: the verdict on the loop closures, with `robust="gnc"`; None otherwise.
         certificate: with `certify`; None otherwise.
         held: indices of the poses that were held: those the file fixes, and the first of every component without any.
@@ -202,7 +202,7 @@ def optimize_pose_graph(
         is_loud = config.objective == "logarithm" and turns(residual, graph, solution.values[0]) > _LOUD
         if loss is None and config.start == "auto" and (first.is_doubtful or is_loud):
             enough = first.enough if first.is_doubtful else None
-            chosen, solution = starts.further(problem, chosen, solution, known, minima, enough)
+            chosen, solution = starts.further(problem, chosen, solution, known, minima, enough, is_loud=is_loud)
             squared = squared_errors(residual, graph, solution.values[0])
         weights = np.ones(len(squared)) if loss is None else problem.groups[0].loss_weights(solution.values)
     solved = time.perf_counter()

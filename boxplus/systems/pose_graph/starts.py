@@ -1,4 +1,4 @@
-"""Which starts an optimisation of a pose graph compares, and which it tries when the first one leads nowhere good."""
+"""Which starts an optimisation of a pose graph compares, and which it tries when the first one leads nowhere good, or may not."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.graphs.pose_graph import PoseGraph
-from boxplus.optimization.losses import Loss
+from boxplus.optimization.losses import Cauchy, Loss
 from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
@@ -20,9 +20,11 @@ from boxplus.systems.pose_graph.named import named
 from boxplus.systems.pose_graph.problem import consecutive_edges, pose_graph_problem, with_edges
 from boxplus.systems.pose_graph.start import chordal_start, components, spanning_tree_start
 
-Start = Literal["file", "spanning_tree", "chordal", "chordal_objective", "graduated"]
+Start = Literal["file", "spanning_tree", "chordal", "chordal_objective", "graduated", "cauchy"]
 Wanted = Literal["auto", "file", "spanning_tree", "chordal"]
 _SAME = 1e-3  # relative difference up to which two minima are one
+_CAUCHY, _ROUNDS = 1.0, 8  # width [standard deviations] of the loss that leaves a minimum, and how often it is tried
+_FALLS = 1e-4  # relative fall of the objective that makes it worth another round
 
 
 class Starts:
@@ -79,6 +81,8 @@ class Starts:
         known: dict[Start, NDArray[np.float64]],
         minima: dict[Start, float],
         enough: float | None,
+        *,
+        is_loud: bool,
     ) -> tuple[Start, Solution]:
         """The lowest minimum of all starts there are, or the first that is low enough.
 
@@ -88,6 +92,7 @@ class Starts:
             minima: the objective at the end of every start; receives those that are tried.
             enough: objective below which nothing further is tried; None where the first one was low enough, and only the
                 minimum of the chordal objective is tried.
+            is_loud: rotations are so noisy that a local minimum may fit; the lowest is then left by a loss that forgets.
         """
         best = (first, solution)
         names: list[Start] = ["chordal_objective", "file", "chordal", "spanning_tree", "graduated"]
@@ -108,7 +113,33 @@ class Starts:
             minima[name] = 2.0 * tried.cost
             if tried.cost < best[1].cost:
                 best = (name, tried)
-        return best
+        return self._relaxed(problem, *best, known, minima) if is_loud else best
+
+    def _relaxed(
+        self,
+        problem: Problem,
+        name: Start,
+        solution: Solution,
+        known: dict[Start, NDArray[np.float64]],
+        minima: dict[Start, float],
+    ) -> tuple[Start, Solution]:
+        """Least squares again from where a Cauchy loss leads from the lowest minimum, while that falls.
+
+        In a local minimum stretches are wound the wrong way, and hold each other by many edges of which each is off by a little
+        more than noise; once large errors count less, those that are right win.
+        """
+        forgetting, _ = pose_graph_problem(self._graph, loss=Cauchy(_CAUCHY))
+        watch = named(self._watch, "from another start, cauchy")
+        for _ in range(_ROUNDS):
+            if self._stopped:
+                break
+            left = forgetting.solve(self._options, start=[solution.values[0]], callback=watch).values[0]
+            tried = problem.solve(self._options, start=[left], callback=watch)
+            if not tried.cost < (1.0 - _FALLS) * solution.cost:
+                break
+            name, solution = "cauchy", tried
+            known[name], minima[name] = left, 2.0 * tried.cost
+        return name, solution
 
     def _make(self, name: Start) -> NDArray[np.float64]:
         if name == "graduated":
