@@ -143,6 +143,14 @@ def test_sources_that_texts_name_are_there_for_their_readers() -> None:
     assert not [str(path.relative_to(ROOT)) for path in (*SOURCES, *pages) if private.search(path.read_text(encoding="utf-8"))]
 
 
+def test_the_page_on_the_architecture_names_every_folder_in_the_row_of_its_room() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `(\w+)/` \| (.*) \|$", page, re.MULTILINE))
+    assert list(rows) == [room for room in ROOMS if (ROOT / "boxplus" / room).is_dir()]
+    folders = sorted({path.parent.relative_to(ROOT / "boxplus") for path in SOURCES if path.parent != ROOT / "boxplus"})
+    assert not [str(f) for f in folders if len(f.parts) > 1 and f"`{f.name}/`" not in rows[f.parts[0]]]
+
+
 @pytest.mark.parametrize("path", [pytest.param(path, id=str(path.relative_to(ROOT))) for path in SOURCES])
 def test_house_rules(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
