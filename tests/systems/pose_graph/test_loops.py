@@ -54,6 +54,21 @@ def test_loops_are_judged_right_and_the_map_is_that_of_the_true_ones(dimension, 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("dimension", "share", "kind"), [(2, 0.3, "random"), (2, 0.6, "mixed"), (2, 0.6, "clustered"), (3, 0.3, "mixed")]
+)
+def test_loops_of_three_thousand_poses_are_judged_right(dimension, share, kind):
+    """Long ones: dead reckoning is off by far more than the city is wide."""
+    simulated = simulate_pose_graph(dimension=dimension, poses=3000, seed=5, false_share=share, false_kind=kind)
+    result = optimize_pose_graph(simulated.graph, GNC)
+    kept, true = result.loops.is_kept & simulated.is_loop, simulated.is_loop & ~simulated.is_false
+    assert (kept & true).sum() >= 0.98 * kept.sum() and (kept & true).sum() >= 0.98 * true.sum()
+    known = optimize_pose_graph(without_false_loops(simulated), PoseGraphConfig(examine=False))
+    assert rms(simulated, result) < 1.2 * rms(simulated, known) + 0.02
+    assert result.doubt is None
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [losses.Tukey(4.685), losses.Welsch(2.985), losses.GemanMcClure(3.787)], ids=lambda x: x.name)
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_losses_that_forget_start_from_the_loops_that_are_believed(dimension, loss):
