@@ -54,7 +54,8 @@ $(VENV)/.runtime: pyproject.toml $(VENV)/.python
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.python
 	@echo "installing boxplus and the tools for its tests into $(VENV) (once; about a minute)"
-	@$(PIP) install -e '.[dev,vision,fleet]'
+	@$(PIP) install -e '.[dev,vision,fleet,sensors]'
+	@$(PIP) install --no-deps 'ouster-sdk>=1.0'
 	@touch $(VENV)/.runtime $@
 
 $(VENV)/.docs: pyproject.toml $(VENV)/.python

@@ -61,8 +61,6 @@ for command in commands:
 
 EXTRAS = ("report", "las", "e57", "geo", "view", "sensors", "vision", "fleet", "gnss")
 """Optional dependencies that the smoke test uses, or at least imports, as well."""
-APART = ("ouster-sdk",)
-"""Asks for a version of rosbags that is older than our oldest: no environment holds both."""
 
 
 def minima() -> list[str]:
@@ -73,8 +71,7 @@ def minima() -> list[str]:
         bound = re.fullmatch(r"([\w.-]+)\s*>=\s*([\w.]+)((?:\s*,[^;]*)?)\s*(;.*)?", requirement)
         if bound is None:
             sys.exit(f"pyproject.toml: expected NAME>=VERSION - got {requirement!r} - declare a lower bound")
-        if bound[1] not in APART:
-            pinned.append(f"{bound[1]}=={bound[2]}{bound[4] or ''}")
+        pinned.append(f"{bound[1]}=={bound[2]}{bound[4] or ''}")
     return pinned
 
 

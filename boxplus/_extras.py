@@ -15,14 +15,14 @@ from typing import Any
 
 from boxplus.errors import InputError
 
-_LIBRARIES = {
+_LIBRARIES: dict[str, tuple[str, str | None]] = {
     "cv2": ("OpenCV", "vision"),
     "dpkt": ("dpkt", "sensors"),
     "fsspec": ("fsspec", "fleet"),
     "laspy": ("laspy", "las"),
     "lazrs": ("lazrs", "las"),
     "matplotlib": ("matplotlib", "report"),
-    "ouster": ("ouster-sdk", "sensors"),
+    "ouster": ("ouster-sdk", None),
     "plotly": ("plotly", "report"),
     "pye57": ("pye57", "e57"),
     "pyproj": ("pyproj", "gnss"),
@@ -31,7 +31,9 @@ _LIBRARIES = {
     "rerun": ("rerun-sdk", "view"),
     "velodyne_decoder": ("velodyne-decoder", "sensors"),
 }
-"""Module: what the library is called, and the extra it belongs to."""
+"""Module: what the library is called, and the extra it belongs to, if it can be installed with boxplus."""
+_OUSTER = "ouster-sdk>=1.0"
+"""Pins libraries that boxplus has newer, an older rosbags among them; works with these, and needs no others here."""
 
 
 def has(*modules: str) -> bool:
@@ -56,7 +58,8 @@ def require(module: str, purpose: str, error: type[InputError] = InputError) -> 
         package = module.partition(".")[0]
         name, extra = _LIBRARIES[package]
         found = "it is not installed" if not has(package) else f"it cannot be imported: {missing}"
-        raise error(f"{name}, {purpose}", found, installation(extra)) from missing
+        line = _pip("--no-deps", _OUSTER) if extra is None else installation(extra)
+        raise error(f"{name}, {purpose}", found, line) from missing
 
 
 def installation(extra: str) -> str:
@@ -64,7 +67,11 @@ def installation(extra: str) -> str:
 
     boxplus is on no index of packages: what would install `boxplus[view]` from there does not work, and its libraries do.
     """
-    wanted = _wanted(extra) or [f"{Path(__file__).resolve().parents[1]}[{extra}]"]
+    return _pip(*_wanted(extra) or [f"{Path(__file__).resolve().parents[1]}[{extra}]"])
+
+
+def _pip(*wanted: str) -> str:
+    """The line for a shell that installs these."""
     pip = [sys.executable, "-m", "pip", "install"] if has("pip") else ["uv", "pip", "install", "--python", sys.executable]
     words = [*pip, *wanted]
     return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)

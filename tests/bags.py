@@ -7,16 +7,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-try:
-    from rosbags.rosbag2 import StoragePlugin
-except ImportError:  # rosbags 0.9, which ouster-sdk asks for, writes SQLite only
-    StoragePlugin = None
 
 Container = Literal["ros1", "mcap", "sqlite3"]
 LAYOUTS = ("velodyne", "ouster", "hesai", "robosense", "generic", "livox_ros_driver", "livox_ros_driver2")
@@ -144,11 +139,7 @@ class _Bag:
 
 
 def _ros2_writer(path: Path, container: Container) -> Any:
-    if StoragePlugin is not None:
-        return Ros2Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3 if container == "sqlite3" else StoragePlugin.MCAP)
-    if container == "mcap":
-        pytest.skip("this version of rosbags cannot write MCAP")
-    return Ros2Writer(path)
+    return Ros2Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3 if container == "sqlite3" else StoragePlugin.MCAP)
 
 
 def write_bag(folder: Path, container: Container, content: Content | None = None) -> Path:

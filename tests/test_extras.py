@@ -17,7 +17,7 @@ PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text
 
 def test_every_library_is_declared_in_the_extra_that_is_named() -> None:
     for name, extra in _extras._LIBRARIES.values():
-        if name == "dpkt":  # what velodyne-decoder brings
+        if name == "dpkt" or extra is None:  # what velodyne-decoder brings; what is installed on its own
             continue
         names = [re.split(r"[\[>=;]", text)[0].lower() for text in PROJECT["optional-dependencies"][extra]]
         assert any(found.startswith(name.lower()) for found in names), (name, extra, names)
@@ -31,6 +31,14 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
     with pytest.raises(RecordingError, match=text):
         _extras.require("ray", "which runs tasks", RecordingError)
     assert not _extras.has("ray")
+
+
+def test_what_cannot_be_an_extra_is_installed_without_the_libraries_it_pins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With them, pip would put an older rosbags in the place of ours."""
+    monkeypatch.setitem(sys.modules, "ouster", None)
+    monkeypatch.setitem(sys.modules, "ouster.sdk", None)
+    with pytest.raises(InputError, match=r"install --no-deps 'ouster-sdk>=1\.0'$"):
+        _extras.require("ouster.sdk", "which decodes this capture")
 
 
 def test_a_library_that_is_broken_says_how(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

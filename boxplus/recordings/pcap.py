@@ -1,4 +1,4 @@
-"""Captures of a LiDAR's network packets, through the vendors' decoders (extra `sensors`).
+"""Captures of a LiDAR's network packets, through the vendors' decoders (extra `sensors`, and ouster-sdk).
 
 Ouster: the capture and the sensor's metadata (.json) beside it; LiDAR and IMU share the sensor's clock, and the metadata gives
 the extrinsic. Velodyne: the capture alone; it holds no IMU.
