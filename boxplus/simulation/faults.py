@@ -19,7 +19,6 @@ Event = Scan | ImuSamples
 Times = NDArray[np.int64]
 _STANDARD_GRAVITY = 9.80665
 
-
 Transform = NDArray[np.float64]
 
 
@@ -340,6 +339,28 @@ def mirror_points(axis: int = 1) -> Fault:
     return Fault("mirror_points", f"points mirrored along {'xyz'[axis]}", _Change(scan))
 
 
+def permute_gyro(order: tuple[int, int, int] = (1, 2, 0)) -> Fault:
+    """The gyroscope reports as x, y and z what its axes `order` measure: one that a driver reads in the wrong order."""
+
+    def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
+        return replace(samples, gyro=samples.gyro[:, list(order)])
+
+    return Fault("permute_gyro", f"rates about {_axes(order)} as those about xyz", _Change(imu=imu))
+
+
+def permute_points(order: tuple[int, int, int] = (1, 2, 0)) -> Fault:
+    """Points have as x, y and z their coordinates `order`: cyclic a turn by 120°, two swapped a left-handed frame."""
+
+    def scan(scan: Scan, inside: _Inside) -> Scan:
+        return replace(scan, p_lidar=np.ascontiguousarray(scan.p_lidar[:, list(order)]))
+
+    return Fault("permute_points", f"coordinates {_axes(order)} of points as xyz", _Change(scan))
+
+
+def _axes(order: tuple[int, int, int]) -> str:
+    return "".join("xyz"[axis] for axis in order)
+
+
 FAULTS: dict[str, Callable[[], Fault]] = {
     "drop_imu": drop_imu,
     "drop_scans": drop_scans,
@@ -359,6 +380,8 @@ FAULTS: dict[str, Callable[[], Fault]] = {
     "clock_drift": clock_drift,
     "scale_points": scale_points,
     "mirror_points": mirror_points,
+    "permute_gyro": permute_gyro,
+    "permute_points": permute_points,
 }
 """Name → maker; without arguments the interval begins 10 s after the start."""
 

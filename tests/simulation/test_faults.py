@@ -190,6 +190,20 @@ def test_scaled_and_mirrored_points(simulation: Simulation) -> None:
             np.testing.assert_array_equal(scan.time_ns, before.time_ns)
 
 
+def test_permuted_axes(simulation: Simulation) -> None:
+    scans, imu = run(simulation, None)
+    spoilt_scans, spoilt = run(simulation, faults.permute_gyro())
+    same_scans(scans, spoilt_scans)
+    np.testing.assert_array_equal(spoilt.gyro, imu.gyro[:, [1, 2, 0]])
+    np.testing.assert_array_equal(spoilt.accel, imu.accel)
+    spoilt_scans, spoilt = run(simulation, faults.permute_points((1, 0, 2)))
+    same_imu(imu, spoilt)
+    for scan, before in zip(spoilt_scans, scans, strict=True):
+        np.testing.assert_array_equal(scan.p_lidar, before.p_lidar[:, [1, 0, 2]])
+        np.testing.assert_array_equal(scan.time_ns, before.time_ns)
+    assert faults.permute_points((1, 0, 2)).description == "coordinates yxz of points as xyz"
+
+
 def test_declared_mountings(simulation: Simulation) -> None:
     other = np.linalg.inv(simulation.T_imu_lidar)
     info = as_recording(simulation, faults.declare(other)).info
