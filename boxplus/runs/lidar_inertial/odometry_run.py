@@ -322,9 +322,13 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
 
     @property
     def _contradiction(self) -> str | None:
-        """Of the LiDARs among each other first: what else is contradicted may follow from it."""
+        """Of the LiDARs among each other first: what else is contradicted may follow from it.
+
+        Then what the first seconds of rotation contradict: the odometry compares shorter stretches, and with an estimate that may
+        have left the truth by then; what it found is among the warnings.
+        """
         of_lidars = None if self._watch is None else self._watch.contradiction
-        rest = self._odometry.contradiction or self._extrinsic.contradiction or self._unknown_mounting
+        rest = self._extrinsic.contradiction or self._odometry.contradiction or self._unknown_mounting
         return of_lidars if rest is None else rest if of_lidars is None else f"{of_lidars}; {rest}"
 
     @property
