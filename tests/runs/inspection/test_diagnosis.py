@@ -148,6 +148,23 @@ def test_degrees_are_found(tmp_path: Path) -> None:
     assert found["gyro_unit"].value == "deg/s" and found["gyro_scale"].verdict == "ok"
 
 
+def test_radians_that_are_declared_degrees_are_an_error_that_names_the_unit(tmp_path: Path) -> None:
+    """Its factor, 1/57, must not pass for a sound recording."""
+    diagnosis, found = examine(tmp_path, Room(transforms=extrinsic(IMU_FROM_LIDAR)), RecordingOptions(gyro_unit="deg/s"))
+    assert diagnosis.verdict == "error" and found["gyro_unit"].value == "deg/s"
+    assert found["gyro_scale"].verdict == "error" and "--gyro-unit rad/s" in found["gyro_scale"].text
+
+
+def test_a_slow_swing_says_nothing_of_the_scale_of_the_gyroscope(tmp_path: Path) -> None:
+    """At less than 2 deg/s its bias and noise are as large as what it measures."""
+    room = Room(transforms=extrinsic(IMU_FROM_LIDAR), swing=0.03)
+    rates = np.linalg.norm([room.imu(START_NS + k * 5_000_000)[0] for k in range(200, 900)], axis=1)
+    assert np.degrees(np.sqrt(np.mean(rates**2))) < 2.0
+    diagnosis, found = examine(tmp_path, room)
+    assert diagnosis.verdict == "ok", [e for e in diagnosis.evidence if e.verdict != "ok"]
+    assert "gyro_scale" not in found or found["gyro_scale"].verdict == "ok"
+
+
 def test_gravity_with_the_wrong_sign(tmp_path: Path) -> None:
     diagnosis, found = examine(tmp_path, Room(accel_factor=-1.0))
     assert diagnosis.verdict == "error"
