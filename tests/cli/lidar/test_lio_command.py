@@ -17,8 +17,9 @@ from boxplus._extras import installation
 from boxplus.cli import app
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.runs.lidar_inertial.summary import read_summary
-from boxplus.simulation import SpinningLidar, simulate
+from boxplus.simulation import SpinningLidar, faults, simulate
 from boxplus.simulation.recording_writer import write_recording
+from tests.systems.lidar_inertial_agreement.small_platforms import handheld
 
 LIDAR = SpinningLidar(azimuth_steps=200)
 
@@ -56,6 +57,22 @@ def test_lio_without_configuration(bag: Path, tmp_path: Path, monkeypatch: pytes
     code, out, err = call("report", folder)
     assert code == 0, err
     assert out.startswith("finished: 29 scans")
+
+
+@pytest.mark.slow
+def test_a_recording_whose_sensors_contradict_each_other_ends_with_exit_code_3(tmp_path: Path) -> None:
+    """Trajectory and report are there all the same, and the first line says that they are not to be trusted, and why."""
+    faulty = write_recording(handheld(4), tmp_path / "faulty", "ros1", faults.flip_accel())
+    out = tmp_path / "out"
+    code, printed, err = call("lio", faulty, "-o", out)
+    assert code == 3, err
+    summary = read_summary(out / "run.json")
+    assert summary.state == "finished" and summary.contradiction is not None
+    assert "its sign is flipped, gravity instead of specific force (negate the accelerations)" in summary.contradiction
+    assert f"finished: {summary.scans} scans" in printed and f"not to be trusted: {summary.contradiction}" in printed
+    assert len(read_trajectory(out / "trajectory.csv")) == summary.scans
+    assert "not to be trusted" in (out / "report.html").read_text(encoding="utf-8")
+    assert "out/report.html" in printed
 
 
 def test_options_reach_the_run(bag: Path, tmp_path: Path) -> None:
@@ -184,6 +201,9 @@ def test_demo_ends_with_accuracy_speed_and_report(tmp_path: Path) -> None:
     assert found is not None
     assert float(found[1]) < 3.0
     assert Path(found[3].strip()).is_file()
+    assert "warning" not in out + err
+    summary = read_summary(tmp_path / "walk_5s_results" / "run.json")
+    assert summary.warnings == [] and summary.contradiction is None and set(summary.status) == {"ok"}
     code, out, err = call("demo", "-o", tmp_path, "--duration", "5")
     assert code == 0, err
     assert "simulated before, used again" in out
