@@ -62,6 +62,18 @@ def parse_transform(text: str, name: str = "T_imu_lidar", *, key: str | None = "
     return _from_numbers(tag, numbers, name)
 
 
+def transform_text(T: NDArray[np.float64]) -> str:
+    """A rigid transform (4, 4) as `parse_transform` reads it.
+
+    Example:
+        >>> transform_text(parse_transform("xyz_rpy_deg: 0.1 0 1.5 0 0 90"))
+        'xyz_qwxyz: 0.10000 0.00000 1.50000 0.7071068 0.0000000 0.0000000 0.7071068'
+    """
+    p = " ".join(f"{value:.5f}" for value in T[:3, 3])
+    q = " ".join(f"{value:.7f}" for value in quaternion.from_matrix(T[None, :3, :3])[0])
+    return f"xyz_qwxyz: {p} {q}"
+
+
 def _split_tag(text: str) -> tuple[str | None, str]:
     tag, colon, body = text.partition(":")
     return (tag.strip(), body) if colon and tag.strip() in _TAGS else (None, text)

@@ -212,8 +212,11 @@ def run(
 
 def _rows(summary: RunSummary, mounting_s: float) -> list[tuple[str, str]]:
     """What the terminal shows of a run of LiDAR and IMU, before which `mounting_s` seconds went into its mounting."""
+    import numpy as np
+
     from boxplus._words import counted
     from boxplus.cli.run_terminal import speed_text
+    from boxplus.runs.transform import transform_text
     from boxplus.sensors.sequencer import BEFORE_START
 
     timing, rows = summary.timing, []
@@ -225,6 +228,10 @@ def _rows(summary: RunSummary, mounting_s: float) -> list[tuple[str, str]]:
     if summary.extrinsic.source == "estimated":
         speed += f", after {mounting_s:.1f} s for the mounting"
     rows.append(("speed", speed))
+    extrinsic = summary.extrinsic
+    if extrinsic.T_imu_lidar_end is not None and extrinsic.source in ("estimated", "identity"):
+        found = transform_text(np.array(extrinsic.T_imu_lidar_end))
+        rows.append(("mounting", f"at the end, for other recordings of these sensors: --T-imu-lidar '{found}'"))
     for lidar in summary.lidars[1:]:
         rows.append((f"LiDAR {lidar.topic}", f"{lidar.merged_points:,} points merged; against the first: {lidar.checked}"))
     rows.append(("map", f"{summary.map.stored_points:,} points" if summary.map.stored_points else "not kept"))
