@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from boxplus.runs.lidar_inertial.earlier_run import Standing
     from boxplus.runs.lidar_inertial.summary import RunSummary
 
+_KNOWN_DEG, _KNOWN_M = 1.0, 0.05  # as well as a mounting has to be known to be given to another recording
+
 
 @takes_recording_options
 def lio(
@@ -229,9 +231,11 @@ def _rows(summary: RunSummary, mounting_s: float) -> list[tuple[str, str]]:
         speed += f", after {mounting_s:.1f} s for the mounting"
     rows.append(("speed", speed))
     extrinsic = summary.extrinsic
-    if extrinsic.T_imu_lidar_end is not None and extrinsic.source in ("estimated", "identity"):
+    deg, m = extrinsic.sigma_end_deg, extrinsic.sigma_end_m
+    if extrinsic.source in ("estimated", "identity") and deg is not None and m is not None and deg < _KNOWN_DEG and m < _KNOWN_M:
         found = transform_text(np.array(extrinsic.T_imu_lidar_end))
-        rows.append(("mounting", f"at the end, for other recordings of these sensors: --T-imu-lidar '{found}'"))
+        known = f"at the end, ± {deg:.2g} deg and {m * 100.0:.2g} cm, for other recordings of these sensors"
+        rows.append(("mounting", f"{known}: --T-imu-lidar '{found}'"))
     for lidar in summary.lidars[1:]:
         rows.append((f"LiDAR {lidar.topic}", f"{lidar.merged_points:,} points merged; against the first: {lidar.checked}"))
     rows.append(("map", f"{summary.map.stored_points:,} points" if summary.map.stored_points else "not kept"))

@@ -276,6 +276,8 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
                 estimation=self._config.odometry.extrinsic_estimation,
                 T_imu_lidar_start=self._extrinsic.T_imu_lidar.tolist(),
                 T_imu_lidar_end=statistics.T_imu_lidar.tolist() if statistics.count else None,
+                sigma_end_deg=statistics.mounting_sigma[0] if statistics.count else None,
+                sigma_end_m=statistics.mounting_sigma[1] if statistics.count else None,
             ),
             lidars=lidars,
             start=None if start is None else StartFacts(kind=start.kind, text=start.text, duration_s=start.duration_s),

@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 
 from boxplus._words import either
+from boxplus.filtering.nav_state import T_THETA_L
 from boxplus.runs.estimate_statistics import EstimateStatistics, GapWatch
 from boxplus.runs.lidar_inertial.first_points import first_points_of
 from boxplus.runs.run_facts import Gap, WarningFacts
@@ -17,6 +18,7 @@ from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING
 
 _VAGUE_M, _VAGUE_SHARE = 0.05, 0.02  # of the way: a position less certain than both is of little use
 
+_PARTS = slice(0, 3), slice(3, 6)  # of the covariance of a mounting: rotation, translation
 _LATE_S = 1.0  # a start in motion may take as long, and a second without a path is not missed
 
 
@@ -30,6 +32,7 @@ class RunStatistics(EstimateStatistics):
         self.first_points: tuple[str | None, ...] | None = None  # digests of those of the first scan that has any
         self.rejected_points: Counter[str] = Counter()
         self.T_imu_lidar = np.eye(4)
+        self._mounting_covariance = np.zeros((6, 6))
         self._position_sigma_m = 0.0
         self._scan_gaps = GapWatch()
 
@@ -55,7 +58,14 @@ class RunStatistics(EstimateStatistics):
         for text in estimate.warnings:
             self.warnings.add(text, estimate.time_ns)
         self.T_imu_lidar[:3, :3], self.T_imu_lidar[:3, 3] = estimate.state.R_imu_lidar, estimate.state.p_imu_lidar
+        self._mounting_covariance = estimate.covariance[T_THETA_L:, T_THETA_L:]
         self._position_sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(estimate.pose_covariance[3:, 3:])[-1], 0.0)))
+
+    @property
+    def mounting_sigma(self) -> tuple[float, float]:
+        """How uncertain the last T_imu_lidar is where that is most: rotation [deg] and translation [m]."""
+        turn, arm = (np.sqrt(max(np.linalg.eigvalsh(self._mounting_covariance[part, part])[-1], 0.0)) for part in _PARTS)
+        return float(np.degrees(turn)), float(arm)
 
     def vague_warnings(self, mounting_sigma: tuple[float, float] | None) -> list[WarningFacts]:
         """A warning where the run ends at a position that it does not claim to know, with what may be behind it.

@@ -67,6 +67,9 @@ def test_the_mounting_at_the_end_is_right_and_can_be_given_to_the_next_run(tmp_p
     off = np.linalg.inv(simulation.T_imu_lidar) @ found
     assert np.linalg.norm(off[:3, 3]) < 0.02
     assert np.degrees(np.linalg.norm(so3.log(off[:3, :3]))) < 0.3
+    facts = read_summary(tmp_path / "unknown" / "run.json").extrinsic
+    assert np.linalg.norm(off[:3, 3]) < 5.0 * facts.sigma_end_m < 0.25
+    assert np.degrees(np.linalg.norm(so3.log(off[:3, :3]))) < 5.0 * facts.sigma_end_deg < 5.0
 
     line = re.search(r"--T-imu-lidar '(xyz_qwxyz: [^']+)'", printed.partition(" mounting ")[2])
     assert line is not None, printed
