@@ -30,8 +30,8 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import 
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist, lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, with_cells_for_all
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
-from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
-from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, wide_prior
+from boxplus.systems.lidar_inertial_agreement.rotation import SCALE, RotationFit, compare_rotations
+from boxplus.systems.lidar_inertial_agreement.translation import SLOPE, TranslationFit, compare_accelerations, wide_prior
 
 _EXPLAINED = 0.8  # of the LiDAR's rotation, before the gyroscope may help to undistort
 _HALF_EXPLAINED = 0.5
@@ -49,6 +49,7 @@ LAG_RAD = float(np.deg2rad(2.5))
 
 _COARSELY_RAD = 0.2
 _DECLARED_ARM_STD = 0.02  # m
+_ENOUGH_SAMPLES = 3.0  # of the IMU from scan to scan: with fewer it misses part of the motion in between
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +187,26 @@ def _compared(
         scaled = ImuSamples(imu.time_ns, imu.gyro / scale, imu.accel)
         translation = compare_accelerations(path, scaled, R, bias / scale, offset, (mean, std))
     rate_hz = 0.0 if len(imu) < 2 else 1e9 / max(float(np.median(np.diff(imu.time_ns))), 1.0)
+    if len(path) > 1 and rate_hz * float(np.median(np.diff(path.time_ns))) * 1e-9 < _ENOUGH_SAMPLES:
+        if rotation is not None:
+            rotation = replace(rotation, covariance=_widened(rotation.covariance, SCALE, _between(imu.gyro)))
+        if translation is not None:
+            unknown = translation.slope * _between(imu.accel)
+            translation = replace(translation, covariance=_widened(translation.covariance, SLOPE, unknown))
     return Agreement(path, rotation, translation, R, rate_hz, _power(imu))
+
+
+def _between(samples: NDArray[np.float64]) -> float:
+    """What share of a signal lies between its samples (N, 3): a parabola is off a chord by an eighth of its second difference."""
+    bent = (np.diff(samples, 2, axis=0) ** 2).sum(axis=1) if len(samples) > 2 else np.zeros(1)
+    about_mean = ((samples - samples.mean(axis=0)) ** 2).sum(axis=1)
+    return float(np.sqrt(bent.mean() / max(about_mean.mean(), 1e-12))) / 8.0
+
+
+def _widened(covariance: NDArray[np.float64], row: int, std: float) -> NDArray[np.float64]:
+    covariance = covariance.copy()
+    covariance[row, row] += std**2
+    return covariance
 
 
 def _doubtful(found: Agreement, T_declared: NDArray[np.float64] | None) -> bool:

@@ -22,6 +22,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Lid
 _LARGEST_OFFSET_S = 0.6
 _OFFSET_STEP_S = 0.02
 FEWEST_INTERVALS = 8
+SCALE = 6  # its row of the covariance
 _ROUNDS = 8
 _LONGEST_GAP_NS = 200_000_000
 _NO_BETTER = 0.5
@@ -85,7 +86,7 @@ class RotationFit:
     @property
     def scale_std(self) -> float:
         """Relative."""
-        return float(np.sqrt(self.covariance[6, 6]))
+        return float(np.sqrt(self.covariance[SCALE, SCALE]))
 
 
 def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.float64] | None = None) -> RotationFit | None:
