@@ -1,25 +1,23 @@
 """A gyroscope or accelerometer that has failed and repeats itself, while the platform moves.
 
 To the filter such a sensor is the best there is, and a platform that seems not to turn drags its map along. Values that are
-the same sample after sample are nothing by themselves: at rest a coarse sensor rounds its noise away. They are where the other
-sensor moves, or where the last ones before were far from them, as nothing stops within a sample. That is said of an IMU with
-noise in the other sensor only: without any it is simulated, and a straight way is a straight way.
+the same sample after sample are nothing by themselves: at rest, or straight on, a coarse sensor rounds its noise away. They are
+where a gyroscope stopped within a sample, as nothing that turns does, and where an accelerometer does not feel a platform that
+turns to and fro. That is said of an IMU with noise in the other sensor only: without any it is simulated.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from boxplus.sensors.imu import ImuSamples
 
-_STUCK_S, _FEWEST = 0.5, 20  # over which, and how many samples, all three axes repeat themselves
-_KEPT_S = 0.7
-_BEFORE, _PARTS = 4, 5  # samples before; parts over whose means vibration is gone
-_SENSORS = (("gyroscope", slice(0, 3)), ("accelerometer", slice(3, 6)))
-_MOVING = {"gyroscope": 0.1, "accelerometer": 0.2}  # rad/s, m/s²: by which means over a tenth of a second differ at no rest
-_STEP = {"gyroscope": 0.1, "accelerometer": 1.0}
-_NOISE = {"gyroscope": 2e-4, "accelerometer": 2e-3}  # second differences that no smooth motion has; real IMUs ten times
+_STUCK_S, _FEWEST = 0.5, 10  # over which, and how many samples, all three axes repeat themselves
+_BEFORE = 4  # samples before, of a turn that lasted
+_MOST_RAD_S2 = 100.0  # by which a turn may stop: 1 rad/s within a hundredth of a second
+_PARTS, _TO_AND_FRO_RAD_S = 5, 0.1  # parts of the time, whose mean rates differ by more
+_GYRO, _ACCEL = slice(0, 3), slice(3, 6)
+_GYRO_NOISE, _ACCEL_NOISE = 2e-4, 2e-3  # rad/s, m/s²: second differences that no smooth motion has; real IMUs ten times
 
 
 class StuckSensor:
@@ -34,29 +32,43 @@ class StuckSensor:
         if not new.any():
             return None
         time_ns = np.concatenate([self._time_ns, imu.time_ns[new]])
-        kept = time_ns >= time_ns[-1] - round(_KEPT_S * 1e9)
-        self._time_ns = time_ns[kept]
-        self._values = np.concatenate([self._values, np.hstack([imu.gyro, imu.accel])[new]])[kept]
-        for (name, axes), (other, other_axes) in (_SENSORS, _SENSORS[::-1]):
-            differs = np.flatnonzero((self._values[:, axes] != self._values[-1, axes]).any(axis=1))
-            begin = int(differs[-1]) + 1 if len(differs) else 0
-            seconds = float(self._time_ns[-1] - self._time_ns[begin]) * 1e-9
-            if seconds < _STUCK_S or len(self._values) - begin < _FEWEST:
-                continue
-            others = self._values[begin:, other_axes]
-            if np.abs(np.diff(others, 2, axis=0)).mean() < _NOISE[other]:
-                continue
-            before, stuck = self._values[max(begin - _BEFORE, 0) : begin, axes], self._values[-1, axes]
-            stepped = len(before) > 0 and float(np.linalg.norm(before.mean(axis=0) - stuck)) > _STEP[name]
-            if stepped or _varies(others) > _MOVING[other]:
-                return (
-                    f"for {seconds:.1f} s the {name} has given the same values sample after sample although the platform moves: "
-                    "it has failed, or its driver repeats what it had last"
-                )
-        return None
+        values = np.concatenate([self._values, np.hstack([imu.gyro, imu.accel])[new]])
+        # As long as what begins within this scan takes to show, and what was before it.
+        enough_ns = round(_STUCK_S * 1e9) + time_ns[-1] - imu.time_ns[0]
+        first = min(int(np.searchsorted(time_ns, time_ns[-1] - enough_ns)), len(time_ns) - _FEWEST - int(new.sum())) - _BEFORE
+        self._time_ns, self._values = time_ns[max(first, 0) :], values[max(first, 0) :]
+        if self._stopped():
+            return self._sentence("gyroscope")
+        return self._sentence("accelerometer") if self._feels_nothing() else None
 
+    def _stopped(self) -> bool:
+        """Whether the gyroscope repeats itself since it stopped within a sample."""
+        begin = self._stuck_since(_GYRO, _ACCEL, _ACCEL_NOISE)
+        if begin is None or begin < _BEFORE:
+            return False
+        steps = np.linalg.norm(self._values[begin - _BEFORE : begin, _GYRO] - self._values[begin, _GYRO], axis=1)
+        seconds = float(self._time_ns[begin] - self._time_ns[begin - 1]) * 1e-9
+        return bool(steps.min() > _MOST_RAD_S2 * seconds)
 
-def _varies(values: NDArray[np.float64]) -> float:
-    """The largest standard deviation of an axis (N, 3), of means over parts of the time."""
-    means = np.array([part.mean(axis=0) for part in np.array_split(values, _PARTS)])
-    return float(means.std(axis=0).max())
+    def _feels_nothing(self) -> bool:
+        """Whether the accelerometer repeats itself while the gyroscope turns to and fro."""
+        begin = self._stuck_since(_ACCEL, _GYRO, _GYRO_NOISE)
+        if begin is None:
+            return False
+        means = np.array([part.mean(axis=0) for part in np.array_split(self._values[begin:, _GYRO], _PARTS)])
+        return bool(means.std(axis=0).max() > _TO_AND_FRO_RAD_S)
+
+    def _stuck_since(self, axes: slice, other: slice, noise: float) -> int | None:
+        """The sample since which a sensor repeats itself, if that is long enough and the other sensor has noise."""
+        differs = np.flatnonzero((self._values[:, axes] != self._values[-1, axes]).any(axis=1))
+        begin = int(differs[-1]) + 1 if len(differs) else 0
+        seconds = float(self._time_ns[-1] - self._time_ns[begin]) * 1e-9
+        if seconds < _STUCK_S or len(self._values) - begin < _FEWEST:
+            return None
+        return begin if np.abs(np.diff(self._values[begin:, other], 2, axis=0)).mean() > noise else None
+
+    def _sentence(self, name: str) -> str:
+        return (
+            f"for half a second and more the {name} has given the same values sample after sample although the platform moves: "
+            "it has failed, or its driver repeats what it had last"
+        )
