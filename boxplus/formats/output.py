@@ -71,17 +71,31 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
         raise
 
 
-def earlier_folder(path: str | Path) -> Path:
-    """Where a folder is while another one takes its place, and stays when the process is killed just then."""
+def beside(path: str | Path, ending: str) -> Path:
+    """The path with an ending after its name.
+
+    Raises:
+        OutputError: it has no name, as the root of a file system has none.
+    """
     target = as_path(path, "a folder")
-    return target.with_name(target.name + EARLIER_SUFFIX)
+    if not target.name:
+        raise OutputError(f"expected a folder with something beside it – got {target} – choose one in it")
+    return target.with_name(target.name + ending)
+
+
+def earlier_folder(path: str | Path) -> Path:
+    """Where a folder is while another one takes its place, and stays when the process is killed just then.
+
+    Raises:
+        OutputError: nothing can take the place of the root of a file system.
+    """
+    return beside(path, EARLIER_SUFFIX)
 
 
 def advice_to_put_back(*folders: Path) -> str:
     """What to do about the first of these folders that is missing where an earlier one was left beside it; empty: none is."""
     for folder in folders:
-        earlier = earlier_folder(folder)
-        if not folder.exists() and earlier.is_dir():
+        if not folder.exists() and (earlier := earlier_folder(folder)).is_dir():
             return f"rename {earlier}, in which the one that was there is whole, to {folder.name}"
     return ""
 
@@ -112,7 +126,7 @@ def replaced_folder(path: str | Path) -> Iterator[Path]:
         OutputError: a folder cannot be created, removed or renamed.
     """
     target = as_path(path, "a file")
-    made, earlier = target.with_name(target.name + TEMPORARY_SUFFIX), earlier_folder(target)
+    made, earlier = beside(target, TEMPORARY_SUFFIX), earlier_folder(target)
     if os.path.ismount(target):  # it could not be renamed, and that would show at the end
         raise OutputError(
             f"expected a folder that another one can take the place of – got {target}, which a file system is mounted at – "

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from boxplus.errors import OutputError
-from boxplus.formats.output import replaced_folder
+from boxplus.formats.output import advice_to_put_back, earlier_folder, replaced_folder
 
 
 def content(folder: Path) -> dict[str, str]:
@@ -35,6 +35,12 @@ def test_the_old_folder_stays_whole_where_the_disk_is_full(folder: Path) -> None
         (made / "two").write_text("ne")
         raise OSError(28, "No space left on device")
     assert content(folder) == {"tiles/one": "old"} and os.listdir(folder.parent) == ["map"]
+
+
+def test_the_root_has_nothing_beside_it() -> None:
+    assert advice_to_put_back(Path("/"), Path("/nowhere"), Path("nowhere")) == ""
+    with pytest.raises(OutputError, match="expected a folder with something beside it – got / – choose one in it"):
+        earlier_folder("/")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="modes are of POSIX")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from boxplus.errors import InputError
-from boxplus.formats.output import earlier_folder, make_folder, output_error, put_back
+from boxplus.formats.output import beside, earlier_folder, make_folder, output_error, put_back
 
 LOCK = "run.lock"
 BESIDE = ".boxplus-lock"
@@ -58,8 +58,9 @@ def locked_beside(folder: Path, program: str) -> Iterator[FolderLock]:
         InputError: another process holds the lock; the message names it.
         OutputError: the folder that holds both cannot be written.
     """
+    path = beside(folder, BESIDE)
     make_folder(folder.parent)
-    with _locked(folder.with_name(folder.name + BESIDE), folder, program) as lock:
+    with _locked(path, folder, program) as lock:
         lock.keep_file = False  # what a killed process left beside the folder goes with the next one
         yield lock
 

@@ -206,8 +206,11 @@ def test_a_map_left_between_two_renames_is_found(tmp_path: Path, missing: str, o
 
 
 def test_what_is_no_map_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="nothing at"):
-        open_saved_map(tmp_path / "nowhere")
+    for nowhere in (tmp_path / "nowhere", Path("/nowhere")):  # the root of the file system has no name to look beside
+        with pytest.raises(InputError, match=f"got nothing at {nowhere} – check the path"):
+            open_saved_map(nowhere)
+        called = CliRunner().invoke(app, ["map", "info", str(nowhere)])
+        assert called.exit_code == 2 and called.stderr.startswith("error: expected ")
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="without map tiles"):
         open_saved_map(tmp_path / "empty")

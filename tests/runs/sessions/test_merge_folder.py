@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from boxplus.errors import InputError
+from boxplus.errors import InputError, OutputError
 from boxplus.runs.sessions.folder import claim_joint_map, claim_merge_folder
 
 SUMMARY = '{"program": "boxplus map merge"}'
@@ -59,6 +59,11 @@ def test_what_is_there_is_not_replaced_unasked(street: Path) -> None:
     with pytest.raises(InputError, match="other files in"):
         go_on(street)
     assert (street / "encounters.csv").read_text() == "old"
+
+
+def test_the_root_of_a_file_system_is_refused() -> None:
+    with pytest.raises(OutputError, match="got / – choose one in it"):
+        go_on("/")
 
 
 def test_a_link_stays_a_link(street: Path) -> None:
