@@ -136,7 +136,7 @@ def slam(
                     loop_view=shown,
                     should_stop=should_stop,
                 )
-            if not no_report:
+            if not no_report and result.summary.scans:
                 with outcome.drawing(terminal):
                     from boxplus.report import write_report
 

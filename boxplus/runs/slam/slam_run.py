@@ -34,6 +34,7 @@ from boxplus.runs.slam.result import SlamResult
 from boxplus.runs.slam.spool import ScanSpool
 from boxplus.runs.slam.summary import LEFT_IN_PLACE, SlamSummary, read_slam_summary
 from boxplus.sensors.geodesy import require_utm
+from boxplus.systems.slam.correction import Correction
 from boxplus.systems.slam.outcome import SlamOutcome
 from boxplus.systems.slam.slam import Slam
 
@@ -143,6 +144,8 @@ class _Run:
                         self._recording, own.odometry.path, config.of_odometry(), extrinsic=extrinsic, resume=self._resume,
                         progress=progress, view=view, companion=beside, should_stop=should_stop,
                     )  # fmt: skip
+                if not search.given:  # it was interrupted before its first pose: nothing is to be closed or moved
+                    return self._without_poses(odometry)
                 outcome = search.finish(lambda: progress(_waiting(search)))
             return self._write(odometry, outcome, spool, search.seconds)
         except BaseException as problem:
@@ -166,6 +169,14 @@ class _Run:
             )  # fmt: skip
         beside.give_again(count)
         return odometry
+
+    def _without_poses(self, odometry: RunSummary) -> SlamResult:
+        """No trajectory and no map; `--resume` goes on from the odometry's checkpoint."""
+        summary = self._facts(odometry.state).model_copy(update={"contradiction": odometry.contradiction})
+        summary.write(self._folder.summary)
+        none = Correction(np.zeros(0, dtype=np.int64), np.zeros((0, 7)), np.zeros((0, 7)))
+        maps = LocalMapFolder(self._folder.local_maps)
+        return SlamResult(self._folder, summary, odometry, SlamOutcome(none, [], None), maps)
 
     def _write(self, odometry: RunSummary, outcome: SlamOutcome, spool: ScanSpool | None, slam_s: float) -> SlamResult:
         own, config = self._folder, self._config

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from boxplus.cli import app
 from boxplus.errors import BoxplusError, InputError, OutputError
 from boxplus.maps.local_maps.folder import LocalMapFolder
 from boxplus.maps.local_maps.local_map import LocalMap
@@ -85,6 +89,18 @@ def test_an_interrupted_run_goes_on_with_the_same_bits(whole: SlamFolder, tmp_pa
     assert read_slam_summary(out.summary).resumed == 2
     with pytest.raises(InputError, match="that did not come to its end"):
         run_slam(walk(), out.path, CONFIG, resume=True)
+
+
+def test_a_run_that_is_interrupted_before_its_first_pose_is_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("boxplus.recordings.open_recording", lambda *_: nullcontext(as_recording(SHORT)))
+    monkeypatch.setattr("boxplus.cli.interrupt.stop_on_interrupt", lambda _: nullcontext(lambda: True))
+    out = SlamFolder(tmp_path / "out")
+    words = ["slam", "walk.bag", "-o", str(out.path), "--T-imu-lidar", "xyz: 0 0 0", "--json"]
+    called = CliRunner().invoke(app, words)
+    assert called.exit_code == 130 and json.loads(called.stdout)["outcome"] == "interrupted", called.stderr
+    summary = read_slam_summary(out.summary)
+    assert (summary.state, summary.scans, summary.local_maps) == ("interrupted", 0, 0)
+    assert out.odometry.checkpoint.exists() and not out.trajectory.exists() and not out.report.exists()
 
 
 @pytest.mark.slow
