@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from boxplus.errors import InputError
 from boxplus.formats.output import TEMPORARY_SUFFIX, make_folder, output_error
+from boxplus.runs.storage.earlier_results import EarlierResults
 from boxplus.runs.storage.folder_lock import LOCK, locked_folder
 
 SUMMARY = "run.json"
+_log = logging.getLogger(__name__)
 
 
 def refuse_both(overwrite: bool, resume: bool) -> None:
@@ -36,6 +39,7 @@ def output_folder(
     *,
     overwrite: bool = False,
     holds_results: Callable[[], bool] = lambda: True,
+    keeps_earlier: bool = False,
 ) -> Iterator[Path]:
     """A folder to write results into, locked while the block runs: new, empty, or cleared of an earlier run's own files.
 
@@ -46,6 +50,8 @@ def output_folder(
         program: who writes here, as `run.json` says; the results of another program are not replaced.
         files, folders: what a run writes, `run.json` included; folders are removed where they are empty, in this order.
         holds_results: whether there are results beside a `run.json`.
+        keeps_earlier: whether results that are replaced stay in the folder, apart, until those of a new run are finished, which
+            `run.json` says then; where it leaves none they are put back.
 
     Raises:
         InputError: another process is writing there; the folder holds something else, or an earlier run's results and
@@ -54,21 +60,43 @@ def output_folder(
     """
     path = make_folder(folder)
     with locked_folder(path, program) as lock:
+        earlier = EarlierResults(path, files, folders, holds_results)
         try:
+            _settle(earlier, program)
             if _has_to_be_cleared(path, program, files, overwrite, lock.began_before, holds_results):
-                # The summary goes last: interrupted here, the folder is still known as a run's.
-                for file in sorted(files(), key=lambda file: file == path / SUMMARY):
-                    for name in (file.name, file.name + TEMPORARY_SUFFIX):
-                        file.with_name(name).unlink(missing_ok=True)
-                for inner in folders():
-                    with suppress(OSError):  # a folder with files of others stays
-                        inner.rmdir()
+                if keeps_earlier and holds_results():
+                    earlier.set_aside()
+                else:
+                    earlier.clear()
         except OSError as error:
             raise output_error(path, error) from error
         try:
-            yield path
+            with settled(earlier, program):
+                yield path
         finally:
             lock.keep_file = not (path / SUMMARY).exists()
+
+
+@contextmanager
+def settled(earlier: EarlierResults, program: str) -> Iterator[None]:
+    """What becomes of results that are kept in a folder, at the end of the block, by how the run that has it now ended."""
+    earlier.put_together()
+    try:
+        yield
+    finally:
+        try:
+            _settle(earlier, program)
+            if earlier.kept.is_dir():
+                _log.warning("the earlier results are kept in %s until a run there comes to its end", earlier.kept)
+        except OSError as error:
+            _log.warning("the earlier results in %s could not be put back or removed: %s", earlier.kept, error)
+
+
+def _settle(earlier: EarlierResults, program: str) -> None:
+    kept, now = earlier.kept / SUMMARY, earlier.path / SUMMARY
+    earlier.put_together()
+    if earlier.kept.is_dir() and not (kept.is_file() and program_of(kept) not in (program, None)):
+        earlier.settle(is_finished=now.is_file() and state_of(now) == "finished")
 
 
 def _has_to_be_cleared(
