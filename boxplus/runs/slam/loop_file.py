@@ -18,6 +18,7 @@ from boxplus.systems.slam.loop import Loop
 Pairs = list[tuple[int, int]]
 
 _KEYS = ("forbid", "force")
+_NAMED = 5  # pairs in a sentence
 _COLUMNS = (
     *("query", "place", "query_s", "place_s", "accepted", "weight", "source", "inliers", "overlap_query", "overlap_place"),
     *("rms_m", "rms_odometry_m", "innovation", "innovation_limit", "measured", "qw", "qx", "qy", "qz", "x", "y", "z", "refusal"),
@@ -81,6 +82,19 @@ def read_loop_decisions(path: str | Path) -> tuple[Pairs, Pairs]:
     if not isinstance(content, dict) or not set(content) <= set(_KEYS):
         raise InputError(f"the keys {' and '.join(_KEYS)} in {path}", f"{content!r}"[:200], advice)
     return _pairs(content, "forbid", path, advice), _pairs(content, "force", path, advice)
+
+
+def pairs_without_maps(forbidden: Pairs, forced: Pairs, count: int) -> list[str]:
+    """What a user decided about local maps that there are not, in sentences; `count` is how many there are."""
+    sentences = []
+    for verb, pairs in (("forbidden", forbidden), ("forced", forced)):
+        if unknown := [f"[{query}, {place}]" for query, place in pairs if query >= count]:
+            named = ", ".join(unknown[:_NAMED]) + (" …" if len(unknown) > _NAMED else "")
+            sentences.append(
+                f"{verb} pairs that do not exist, as there are local maps 0 to {count - 1} only: {named}; "
+                "take pairs from loops.csv"
+            )
+    return sentences
 
 
 def _pairs(content: dict[str, object], key: str, path: str | Path, advice: str) -> Pairs:

@@ -28,7 +28,7 @@ from boxplus.runs.slam.corrected import write_corrected_map, write_corrected_tra
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
 from boxplus.runs.slam.gnss_output import gnss_facts, gnss_warnings, lay_onto_earth, write_georeference
 from boxplus.runs.slam.graph_file import write_graph
-from boxplus.runs.slam.loop_file import Pairs, write_loops
+from boxplus.runs.slam.loop_file import Pairs, pairs_without_maps, write_loops
 from boxplus.runs.slam.loop_search import LoopSearch
 from boxplus.runs.slam.result import SlamResult
 from boxplus.runs.slam.spool import ScanSpool
@@ -99,7 +99,7 @@ def run_slam(
     else:
         claimed = claim_slam_folder(folder, overwrite=overwrite, resume=resume)  # type: ignore[assignment]
     with claimed as own:
-        run = _Run(recording, own, config, resume)
+        run = _Run(recording, own, config, resume, (forbidden or [], forced or []))
         search = LoopSearch(config.slam, forbidden or [], forced or [], make_folder(own.local_maps), own.graph)
         return run.execute(search, extrinsic, progress or (lambda _: None), view, loop_view, should_stop or (lambda: False))
 
@@ -107,8 +107,11 @@ def run_slam(
 class _Run:
     """One run: the odometry, then what closing the loops makes of its results."""
 
-    def __init__(self, recording: Recording, folder: SlamFolder, config: SlamRunConfig, resume: bool) -> None:
+    def __init__(
+        self, recording: Recording, folder: SlamFolder, config: SlamRunConfig, resume: bool, decided: tuple[Pairs, Pairs]
+    ) -> None:
         self._recording, self._folder, self._config, self._resume = recording, folder, config, resume
+        self._decided = decided  # forbidden and forced
         self._started, self._resumed = datetime.now(UTC), 0
         text = dump_slam_config(config)
         if resume:
@@ -183,6 +186,7 @@ class _Run:
         began = time.perf_counter()
         outcome, earth = lay_onto_earth(self._recording, own, outcome, config)
         correction, gnss, told = outcome.correction, None, [] if outcome.accepted else [LEFT_IN_PLACE]
+        told += pairs_without_maps(*self._decided, len(correction.time_ns))
         doubt = odometry.contradiction or outcome.doubt
         write_corrected_trajectory(own, outcome.placed, is_closed=bool(outcome.accepted))
         if earth is not None:

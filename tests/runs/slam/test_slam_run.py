@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.runs.run_facts import WarningFacts
 from boxplus.runs.slam.config import load_slam_config
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
-from boxplus.runs.slam.loop_file import read_loop_decisions
+from boxplus.runs.slam.loop_file import pairs_without_maps, read_loop_decisions
 from boxplus.runs.slam.result import SlamResult, load_slam_result
 from boxplus.runs.slam.slam_run import run_slam
 from boxplus.runs.slam.spool import ScanSpool, SpooledScan, read_spool
@@ -74,7 +75,7 @@ def block() -> Recording:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     folder = SlamFolder(tmp_path_factory.mktemp("slam") / "out")
     config = load_slam_config(settings=[*SETTINGS, "gnss.utm=true"])
-    result = run_slam(block(), folder.path, config)
+    result = run_slam(block(), folder.path, config, forbidden=[(400, 1)], forced=[(500, 2), (501, 2)])
     write_report(result)
     return Finished(folder, result, round_a_block())
 
@@ -187,6 +188,18 @@ def test_the_loop_search_beside_finds_what_the_same_local_maps_give(finished: Fi
 def test_a_folder_with_results_is_replaced_only_when_asked(finished: Finished) -> None:
     with pytest.raises(InputError, match="--overwrite"), claim_slam_folder(finished.folder.path):
         pass
+
+
+def test_decisions_about_local_maps_that_there_are_not_are_told(finished: Finished) -> None:
+    count = finished.result.summary.local_maps
+    told = finished.result.summary.warnings
+    only = f"pairs that do not exist, as there are local maps 0 to {count - 1} only"
+    for text in (
+        f"forbidden {only}: [400, 1]; take pairs from loops.csv",
+        f"forced {only}: [500, 2], [501, 2]; take pairs from loops.csv",
+    ):
+        assert text in told and text in unescape(finished.folder.report.read_text(encoding="utf-8"))
+    assert pairs_without_maps([(count - 1, 0)], [], count) == []
 
 
 def test_decisions_of_a_user(tmp_path: Path) -> None:
