@@ -13,6 +13,15 @@ from boxplus.cli.examples import EXAMPLES
 _VALUES = {"path": "PATH", "int": "N", "int range": "N", "float": "X", "float range": "X", "str": "TEXT", "list[str]": "TEXT"}
 """What stands for a value, by the name that typer has for its type."""
 
+_UsageError: Any = typer.BadParameter.__base__  # of the click that typer brings along
+_ONE_ONLY = {
+    "slam": "it takes one recording; 'boxplus fleet run' takes a folder of them and joins those that met, 'boxplus map merge' "
+    "joins runs that are there",
+    "localize": "it takes one recording; call it once for each",
+    "fleet run": "it takes one folder, or a .txt file with one path a line",
+}
+"""Commands of one recording, and what to do with several."""
+
 
 class Command(TyperCommand):
     """A command whose help shows its options under the names of their panels, and examples of how it is called."""
@@ -23,6 +32,12 @@ class Command(TyperCommand):
             return list(super().parse_args(ctx, args))
         except typer.BadParameter as error:
             error.message = error.message.removeprefix("Value error, ")
+            raise
+        except _UsageError as error:
+            known: Any = error
+            advice = _ONE_ONLY.get(ctx.command_path.partition(" ")[2])
+            if advice is not None and known.message.startswith("Got unexpected extra argument"):
+                known.message = f"{known.message}: {advice}"
             raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from boxplus._extras import require
+from boxplus.errors import InputError
 
 if TYPE_CHECKING:
     from boxplus.report.cameras.visual_data import VisualData
@@ -72,4 +73,16 @@ def load_report(folder: str | Path) -> AnyRun:
             return load_direct_run(folder)
         if program == "boxplus slam":
             return load_slam_result(folder)
+        if program not in (None, "boxplus lio"):
+            raise _of_another(Path(folder), program)
     return load_run(folder)
+
+
+def _of_another(folder: Path, program: str) -> InputError:
+    """What to do about the folder of a command whose report is drawn once."""
+    advice = "it has no report; run.json has the facts"
+    if (folder / "report.html").is_file():
+        advice = "open its report.html, which that command has drawn"
+    elif (folder / "odometry" / "run.json").is_file():
+        advice = f"draw that of its odometry: 'boxplus report {folder / 'odometry'}'"
+    return InputError("the output folder of 'boxplus lio', 'slam', 'vio' or 'vo'", f"one of {program!r} ({folder})", advice)

@@ -158,7 +158,7 @@ def read_facts(kind: type[PartT], path: str | Path) -> PartT:
             raise InputError(
                 f"the output folder of '{program}'",
                 f"one of {first['input']!r} ({path})",
-                "open its report.html, or run that command again",
+                f"give one of '{program}'",
             ) from error
         raise InputError(
             "run.json as this version of boxplus writes it", f"{where}: {first['msg']} ({path})", f"run '{program}' again"

@@ -95,7 +95,9 @@ def _read_yaml(path: Path, known: Sections) -> dict[str, dict[str, object]]:
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise InputError(f"a YAML file with {sections}", f"none of them in {path}", "write e.g. 'odometry:' and keys below")
+        raise InputError(
+            f"a YAML file with {sections}", f"none of them in {path}", f"write e.g. '{_example(known)[0]}:' and keys below"
+        )
     for section, values in content.items():
         if section not in known:
             home = [name for name, model in known.items() if section in model.model_fields]
@@ -105,14 +107,16 @@ def _read_yaml(path: Path, known: Sections) -> dict[str, dict[str, object]]:
             raise InputError(f"keys and values below '{section}:' in {path}", repr(values), "write one 'key: value' a line")
         for key in values or {}:
             if not isinstance(key, str):
-                raise InputError(f"names of settings below '{section}:' in {path}", repr(key), "write e.g. 'scan_voxel: 0.5'")
+                raise InputError(
+                    f"names of settings below '{section}:' in {path}", repr(key), f"write e.g. '{_example(known)[1]}'"
+                )
     return {section: values or {} for section, values in content.items()}
 
 
 def _parse_setting(text: str, sections: Sections) -> tuple[str, str, object]:
     name, equals, value = text.partition("=")
     if not equals:
-        raise InputError("a setting as key=value", repr(text), "write e.g. --set scan_voxel=0.5")
+        raise InputError("a setting as key=value", repr(text), f"write e.g. --set {_example(sections)[1].replace(': ', '=')}")
     section, dot, key = name.strip().rpartition(".")
     if not dot:
         homes = [candidate for candidate, model in sections.items() if key in model.model_fields]
@@ -128,6 +132,19 @@ def _parse_setting(text: str, sections: Sections) -> tuple[str, str, object]:
         return section, key, yaml.load(value, _Yaml)
     except yaml.YAMLError as error:
         raise InputError(f"a value for {section}.{key}", repr(value), "write a number, a word or a [list]") from error
+
+
+def _example(sections: Sections) -> tuple[str, str]:
+    """A section, and a setting of it as the YAML file has it."""
+    if "odometry" in sections and "scan_voxel" in sections["odometry"].model_fields:
+        return "odometry", "scan_voxel: 0.5"
+    numbers = (
+        (section, f"{key}: {field.default}")
+        for section, model in sections.items()
+        for key, field in model.model_fields.items()
+        if isinstance(field.default, (int, float)) and not isinstance(field.default, bool)
+    )
+    return next(numbers)
 
 
 def _check_key(section: str, key: str, sections: Sections) -> None:

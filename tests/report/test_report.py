@@ -208,6 +208,13 @@ def test_folder_of_something_else(tmp_path: Path) -> None:
         InputError, match=r"expected run.json as this version of boxplus writes it – got versions: Field required"
     ):
         write_report(tmp_path)
+    (tmp_path / "run.json").write_text('{"program": "boxplus map merge"}')
+    expected = r"expected the output folder of 'boxplus lio', 'slam', 'vio' or 'vo' – got one of 'boxplus map merge' \(.*\) – "
+    with pytest.raises(InputError, match=expected + "it has no report; run.json has the facts"):
+        write_report(tmp_path)
+    (tmp_path / "report.html").touch()
+    with pytest.raises(InputError, match=expected + "open its report.html"):
+        write_report(tmp_path)
 
 
 def test_a_config_in_another_encoding_is_shown_all_the_same(folder: Path, tmp_path: Path) -> None:

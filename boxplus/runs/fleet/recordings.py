@@ -47,14 +47,18 @@ def find_recordings(path: str | Path) -> dict[str, Path]:
         if again := [entry for entry, times in Counter(entry.resolve() for entry in found).items() if times > 1]:
             raise InputError("every recording once", f"{again[0]} twice in {base}", "leave one out: it would count twice")
     else:
-        raise InputError("a folder with recordings, or a list in a .txt file", f"{base}", "check the path")
+        got, advice = f"nothing at {base}", "check the path"
+        if base.exists():
+            got = f"the file {base}"
+            advice = "give the folder that it is in, or a .txt file with one path a line; for one recording run 'boxplus slam'"
+        raise InputError("a folder with recordings, or a list in a .txt file", got, advice)
     return named(found)
 
 
 def holds_recordings(path: str | Path) -> bool:
     """Whether it is a folder of recordings, and no recording itself to `open_recording`."""
     folder = Path(path)
-    return folder.is_dir() and not _is_recording(folder) and any(map(_is_recording, folder.iterdir()))
+    return folder.is_dir() and not is_recording(folder) and any(map(is_recording, folder.iterdir()))
 
 
 def named(recordings: Iterable[Path]) -> dict[str, Path]:
@@ -70,7 +74,8 @@ def named(recordings: Iterable[Path]) -> dict[str, Path]:
     return found
 
 
-def _is_recording(entry: Path) -> bool:
+def is_recording(entry: Path) -> bool:
+    """Whether `open_recording` takes a file or folder, by its name or what is in it."""
     if not entry.is_dir():
         return entry.suffix.lower() in _SUFFIXES
     return is_described(entry) or (entry / "velodyne_points").is_dir() or _is_undescribed(entry)
@@ -79,13 +84,13 @@ def _is_recording(entry: Path) -> bool:
 def _is_undescribed(folder: Path) -> bool:
     """Whether an interrupted recorder has left the parts of one recording there, and there is no other one beside them."""
     parts = bag_files(folder)
-    others = (entry for entry in folder.iterdir() if entry not in parts and _is_recording(entry))
+    others = (entry for entry in folder.iterdir() if entry not in parts and is_recording(entry))
     return bool(parts) and not any(others) and len(recordings_among(parts)) == 1
 
 
 def _entries(folder: Path) -> list[Path]:
     """The recordings in a folder, or itself."""
-    if _is_recording(folder):
+    if is_recording(folder):
         return [folder]
     for parts in recordings_among(bag_files(folder)):
         if len(parts) > 1:
@@ -94,4 +99,4 @@ def _entries(folder: Path) -> list[Path]:
                 f"{len(parts)} parts of one, {parts[0].name} to {parts[-1].name}, beside others in {folder}",
                 "put them into a folder of their own; where all are one with a pause, let 'ros2 bag reindex' write metadata.yaml",
             )
-    return sorted(entry for entry in folder.iterdir() if _is_recording(entry))
+    return sorted(entry for entry in folder.iterdir() if is_recording(entry))

@@ -14,10 +14,11 @@ from boxplus.manifolds import se3
 from boxplus.manifolds.se3 import SE3
 from boxplus.recordings.recording import Recording
 from boxplus.runs.slam.config import SlamRunConfig, load_slam_config
-from boxplus.runs.slam.folder import SlamFolder
+from boxplus.runs.slam.folder import PROGRAM, SlamFolder
 from boxplus.runs.slam.gnss_output import located, read_origin
 from boxplus.runs.slam.graph_file import read_graph
 from boxplus.runs.slam.summary import SlamSummary, read_slam_summary
+from boxplus.runs.storage.output_folder import SUMMARY, program_of
 from boxplus.systems.refinement.outside import Receiver, RunFixes, RunLoops
 from boxplus.systems.slam.outcome import SlamOutcome
 
@@ -87,6 +88,24 @@ class ClosedRun:
             delay_sigma=gnss.delay_sigma,
             vertical_sigma=self.config.slam.gravity_sigma,
         )
+
+
+def is_closed_run(folder: Path) -> bool:
+    """Whether it is the output folder of 'boxplus slam'.
+
+    Raises:
+        InputError: it is that of a command whose results cannot be refined.
+    """
+    summary = folder / SUMMARY
+    program = program_of(summary) if summary.is_file() else None
+    if program in (None, "boxplus lio"):
+        return False
+    if program != PROGRAM:
+        raise InputError(
+            "the output folder of 'boxplus lio' or 'boxplus slam'", f"one of {program!r} ({folder})",
+            "give the folder of a run that came before it, or run one of these on the recording",
+        )  # fmt: skip
+    return True
 
 
 def read_closed_run(folder: str | Path) -> ClosedRun:

@@ -27,13 +27,12 @@ from boxplus.recordings.open import open_recording
 from boxplus.runs.lidar_inertial.config import RunConfig, load_run_config
 from boxplus.runs.lidar_inertial.scan_log import read_scan_log, unmeasured
 from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
-from boxplus.runs.refinement.closed_run import ClosedRun, read_closed_run
+from boxplus.runs.refinement.closed_run import ClosedRun, is_closed_run, read_closed_run
 from boxplus.runs.refinement.config import RefineRunConfig, dump_refine_config
 from boxplus.runs.refinement.folder import RefineFolder
 from boxplus.runs.refinement.summary import MapSharpness, RefinedReceiver, RefineSummary
 from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.run_loop import peak_memory_mb, versions
-from boxplus.runs.storage.output_folder import program_of
 from boxplus.systems.refinement.collecting import OdometryRows, collect
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.loops import contradicted
@@ -95,7 +94,7 @@ def read_odometry_run(folder: str | Path) -> OdometryRun:
             assumption, too short, or most of whose scans were weak or lost.
     """
     path, closed = Path(folder), None
-    if (path / "run.json").is_file() and program_of(path / "run.json") == "boxplus slam":
+    if is_closed_run(path):
         closed, path = read_closed_run(path), path / "odometry"
     run = RunFolder(path)
     summary = read_summary(run.summary)

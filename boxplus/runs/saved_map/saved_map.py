@@ -19,6 +19,7 @@ from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.maps.tiles.layout import MANIFEST, TileIndex, split_by_tile, tile_folder
 from boxplus.maps.tiles.store import TileStore
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
+from boxplus.runs.fleet.recordings import is_recording
 from boxplus.runs.run_folder import RunFolder, run_of_map
 from boxplus.runs.saved_map.places import along, over_ground
 from boxplus.runs.saved_map.tiled_points import TiledPoints
@@ -27,6 +28,8 @@ from boxplus.runs.storage.output_folder import doubts_of, program_of
 _ROUNDING = 0.01  # m, by which a point may lie outside of its tile
 _TILE = 32.0  # m, in memory, of a cloud from a file
 _WHAT = "a folder of 'boxplus lio' or 'boxplus slam', a map folder with tiles, or a PLY, PCD, LAS, LAZ or E57 file"
+
+_MAKE_ONE = "make a map of it by 'boxplus slam', and give its output folder"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,8 +121,7 @@ def _what_is_in(base: Path, report: list[str], doubts: list[str], accepted: list
     if folder is None:
         return base, "map folder", None
     if not is_bare and not (folder.tiles / MANIFEST).is_file():
-        advice = advice_to_put_back(folder.tiles) or "run without --no-map"
-        raise InputError(_WHAT, f"a folder without map tiles, {base}", advice)
+        raise _no_tiles(folder)
     program = program_of(folder.summary) if folder.summary.is_file() else None
     has_trajectory = folder.trajectory.is_file()
     if program is not None:
@@ -129,6 +131,19 @@ def _what_is_in(base: Path, report: list[str], doubts: list[str], accepted: list
         report.append(f"the map belongs to the run in {folder.path}, whose trajectory is used")
     kind = "map folder" if is_bare and not has_trajectory else program or "map folder"
     return folder.tiles, kind, _trajectory(folder, report) if has_trajectory else None
+
+
+def _no_tiles(folder: RunFolder) -> InputError:
+    """What is in place of a map, and what to do about it."""
+    advice = advice_to_put_back(folder.tiles)
+    if folder.summary.is_file():
+        return InputError(
+            _WHAT, f"a folder of {program_of(folder.summary) or 'a run'!r} without map tiles, {folder.path}",
+            advice or "run without --no-map, or give the folder of a run that wrote a map",
+        )  # fmt: skip
+    if is_recording(folder.path):
+        return InputError(_WHAT, f"a recording, {folder.path}", _MAKE_ONE)
+    return InputError(_WHAT, f"a folder without map tiles, {folder.path}", advice or "give the output folder of a run")
 
 
 def _trajectory(folder: RunFolder, report: list[str]) -> Trajectory:
@@ -170,7 +185,7 @@ def _of_file(path: Path, voxel: float) -> tuple[TiledPoints, NDArray[np.float64]
     """A cloud is kept in memory as a whole, thinned; and the origin (3,) that it is counted from."""
     origin, ending = np.zeros(3), path.suffix.lower()
     if ending not in CLOUD_ENDINGS:
-        raise InputError(_WHAT, f"a file {path.name}", "convert it to one of these")
+        raise InputError(_WHAT, f"a file {path.name}", _MAKE_ONE if is_recording(path) else "convert it to one of these")
     if ending in (".las", ".laz"):
         cloud, origin = read_survey(path)
     else:

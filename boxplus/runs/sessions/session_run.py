@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.errors import InputError
+from boxplus.formats.output import advice_to_put_back
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.folder import LocalMapFolder
@@ -105,6 +106,9 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
             local map that is damaged.
     """
     own = SlamFolder(Path(folder))
+    if not own.path.exists():
+        advice = advice_to_put_back(own.path) or "check the path"
+        raise InputError("the output folder of a run of 'boxplus slam'", f"nothing at {own.path}", advice)
     program = program_of(own.summary) if own.summary.is_file() else None
     if program != PROGRAM:
         raise InputError("the output folder of a run of 'boxplus slam'", f"{own.path} ({program or 'no run'})", _ADVICE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +58,9 @@ def output_folder(
             `overwrite` is not set.
         OutputError: it cannot be created or cleared.
     """
+    is_new = not Path(folder).exists()
     path = make_folder(folder)
-    with locked_folder(path, program) as lock:
+    with _gone_where_empty(path, is_new), locked_folder(path, program) as lock:
         earlier = EarlierResults(path, files, folders, holds_results)
         try:
             _settle(earlier, program)
@@ -74,7 +75,18 @@ def output_folder(
             with settled(earlier, program):
                 yield path
         finally:
-            lock.keep_file = not (path / SUMMARY).exists()
+            lock.keep_file = not (path / SUMMARY).exists() and any(entry.name != LOCK for entry in path.iterdir())
+
+
+@contextmanager
+def _gone_where_empty(path: Path, is_new: bool) -> Iterator[None]:
+    """A folder that was made for a run which then was refused does not stay."""
+    try:
+        yield
+    finally:
+        if is_new:
+            with suppress(OSError):  # there is something in it
+                path.rmdir()
 
 
 @contextmanager

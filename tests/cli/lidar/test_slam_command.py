@@ -69,6 +69,22 @@ def test_a_ground_truth_that_cannot_be_used_is_refused_before_the_run(tmp_path: 
     assert result.exit_code == 2 and "none.tum" in result.stderr and not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("words", [["slam"], ["localize", "--map", "nowhere"]])
+@pytest.mark.parametrize("is_there", [False, True])
+def test_a_run_that_is_refused_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], is_there: bool
+) -> None:
+    """Once an empty one with the lock of a run that never was."""
+    info = SimpleNamespace(path=Path("walk.bag"), format="ros1", duration_s=1.0, message_count=1, evidence=[], imu_topic="")
+    monkeypatch.setattr(boxplus.recordings, "open_recording", lambda *_: nullcontext(SimpleNamespace(info=info)))
+    out = tmp_path / "out"
+    if is_there:
+        out.mkdir()
+    result = CliRunner().invoke(app, [words[0], "walk.bag", "-o", str(out), *words[1:]])
+    assert (result.exit_code == 2 and "a LiDAR alone in walk.bag" in result.stderr) or "nothing at nowhere" in result.stderr
+    assert list(tmp_path.rglob("*")) == [out] * is_there
+
+
 @pytest.mark.parametrize("command", ["lio", "slam", "vio", "vo"])
 @pytest.mark.parametrize("words", [["--overwrite", "--resume"], ["--resume", "--overwrite"]])
 def test_an_earlier_run_is_replaced_or_gone_on_with(command: str, words: list[str], tmp_path: Path) -> None:

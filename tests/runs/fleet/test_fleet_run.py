@@ -365,9 +365,13 @@ def test_recordings_are_found_in_a_folder_or_a_list(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=message):
             find_recordings(listed)
     (tmp_path / "empty").mkdir()
-    for path in (tmp_path / "empty", tmp_path / "b.bag"):
-        with pytest.raises(InputError, match="recordings"):
-            find_recordings(path)
+    for path, message in (
+        ("empty", "got none in .*empty – put bags"),
+        ("b.bag", "got the file .*b.bag – give the folder that it is in, or a .txt file.*; for one recording run 'boxplus slam'"),
+        ("none", "got nothing at .*none – check the path"),
+    ):
+        with pytest.raises(InputError, match=message):
+            find_recordings(tmp_path / path)
     with pytest.raises(InputError, match="a recording at least"):
         run_fleet({}, tmp_path / "out", InProcess())
 

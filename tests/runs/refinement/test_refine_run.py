@@ -110,6 +110,9 @@ def test_a_rejected_run_without_covariances_is_given_none(
 def test_what_is_no_run_or_another_recording_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
     code, _, err = call("refine", tmp_path / "nothing", "-o", tmp_path / "out")
     assert code == 2 and "run.json" in err
+    (tmp_path / "run.json").write_text('{"program": "boxplus vio"}')
+    code, _, err = call("refine", tmp_path, "-o", tmp_path / "out")
+    assert code == 2 and "expected the output folder of 'boxplus lio' or 'boxplus slam' – got one of 'boxplus vio'" in err
     code, _, err = call("refine", folders[0], "-o", folders[0] / "inside")
     assert code == 2 and "another folder than that of the run" in err
     code, _, err = call("refine", folders[0], "-o", tmp_path / "gone", "--recording", tmp_path / "gone.bag")

@@ -212,8 +212,18 @@ def test_what_is_no_map_is_refused(tmp_path: Path) -> None:
         called = CliRunner().invoke(app, ["map", "info", str(nowhere)])
         assert called.exit_code == 2 and called.stderr.startswith("error: expected ")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="without map tiles"):
+    with pytest.raises(InputError, match=r"without map tiles, .*empty – give the output folder of a run"):
         open_saved_map(tmp_path / "empty")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.json").write_text('{"program": "boxplus lio"}')
+    with pytest.raises(InputError, match=r"a folder of 'boxplus lio' without map tiles, .*run – run without --no-map"):
+        open_saved_map(tmp_path / "run")
+    (tmp_path / "ros2").mkdir()
+    (tmp_path / "ros2" / "metadata.yaml").touch()
+    (tmp_path / "drive.bag").touch()
+    for recording in ("ros2", "drive.bag"):
+        with pytest.raises(InputError, match=f"{recording} – make a map of it by 'boxplus slam', and give its output folder"):
+            open_saved_map(tmp_path / recording)
     (tmp_path / "text.txt").write_text("no points")
     with pytest.raises(InputError, match="LAZ or E57 file"):
         open_saved_map(tmp_path / "text.txt")

@@ -145,6 +145,12 @@ def test_what_cannot_be_merged_is_refused(
         merge_runs([runs[0][0], runs[0][0]], tmp_path / "out")
     with pytest.raises(InputError, match="the output folder of a run of 'boxplus slam'"):
         merge_runs([runs[0][0], merged[0]], tmp_path / "out")
+    with pytest.raises(InputError, match=r"got nothing at .*nope – check the path"):
+        merge_runs([runs[0][0], tmp_path / "nope"], tmp_path / "out")
+    with pytest.raises(InputError, match=r"none of them in .*wrong.yaml – write e.g. 'sessions:' and keys below"):
+        (tmp_path / "wrong.yaml").write_text("[1, 2]")
+        load_settings(MergeConfig, tmp_path / "wrong.yaml")
+    (tmp_path / "wrong.yaml").unlink()
     with pytest.raises(InputError, match="add --overwrite"):
         merge_runs(runs[0][:2], merged[0])
     (tmp_path / "mine.txt").write_text("mine")
