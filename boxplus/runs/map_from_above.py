@@ -16,6 +16,7 @@ from boxplus.maps.floor_plan.occupancy import FloorPlanConfig, Occupancy
 from boxplus.maps.floor_plan.raster import Floats, GroundHeights, Raster
 from boxplus.maps.tiles.store import TileStore
 from boxplus.runs.run_folder import RunFolder
+from boxplus.runs.saved_map.map_trajectories import map_trajectories
 from boxplus.runs.slam.gnss_output import read_origin
 
 _STOREY = 2.0  # m between two heights of the path at one place that are two storeys
@@ -25,7 +26,7 @@ _HEAD_ROOM = 20.0  # m above the path that a height map still takes
 
 
 class MapFromAbove:
-    """The map of a run of `boxplus lio` or `boxplus slam`, cut around its path, and the ground below it.
+    """The map of a run of `boxplus lio` or `boxplus slam`, or a joint map, cut around its paths, and the ground below them.
 
     Args:
         folder: the output folder.
@@ -45,7 +46,7 @@ class MapFromAbove:
         self._config = as_settings(FloorPlanConfig, config)
         self.store = TileStore.open(run.tiles)
         self.frame = read_origin(run.path)
-        p = read_trajectory(run.trajectory).p
+        p = np.concatenate([trajectory.p for trajectory in map_trajectories(run.path) or [read_trajectory(run.trajectory)]])
         if z is not None and len(p):
             lowest, highest = p[:, 2].min(), p[:, 2].max()
             p = p[(p[:, 2] >= z[0]) & (p[:, 2] <= z[1])]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 def localize(
     recording: RecordingArgument,
     saved: Annotated[
-        Path, typer.Option("--map", "-m", help="Folder of 'boxplus lio' or 'boxplus slam', map folder, or point cloud file.")
+        Path, typer.Option("--map", "-m", help="Folder of 'boxplus lio', 'slam' or 'map merge', map folder, or point cloud file.")
     ],
     output: Annotated[
         Path | None,

@@ -9,7 +9,7 @@ import typer
 
 from boxplus.errors import InputError
 
-_Run = Annotated[Path, typer.Argument(help="The output folder of 'boxplus lio' or 'boxplus slam'.", metavar="DIR")]
+_Run = Annotated[Path, typer.Argument(help="The output folder of 'boxplus lio', 'slam' or 'map merge'.", metavar="DIR")]
 _Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")]
 _Slope = Annotated[float, typer.Option(help="Steepest ground, rise by distance.", min=0.01)]
 _Z = Annotated[

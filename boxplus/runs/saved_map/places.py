@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,11 +30,18 @@ _MOST_PLACES = 2000
 _SPACING = 1.5  # voxels, between the points of a surface that has one a voxel
 
 
-def along(trajectory: Trajectory, near: Near, config: LocalMapConfig) -> list[LocalMap]:
-    """Local maps along a trajectory, cut as `LocalMapBuilder` does, each with what can be seen of the map from its stretch.
+def along(trajectories: Sequence[Trajectory], near: Near, config: LocalMapConfig) -> list[LocalMap]:
+    """Local maps along trajectories, cut as `LocalMapBuilder` does, each with what can be seen of the map from its stretch.
 
-    Poses whose status is `lost` are left out: nobody knows where they are.
+    They are numbered through. Poses whose status is `lost` are left out: nobody knows where they are.
     """
+    found = list[LocalMap]()
+    for trajectory in trajectories:
+        found += [replace(own, number=len(found) + own.number) for own in _along(trajectory, near, config)]
+    return found
+
+
+def _along(trajectory: Trajectory, near: Near, config: LocalMapConfig) -> list[LocalMap]:
     builder = LocalMapBuilder(config)
     none = np.zeros((0, 3), np.float32)
     known = np.array([True] * len(trajectory) if trajectory.status is None else [s != "lost" for s in trajectory.status])

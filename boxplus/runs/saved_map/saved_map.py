@@ -13,7 +13,7 @@ from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_file import CLOUD_ENDINGS, read_cloud
 from boxplus.formats.clouds.las import read_survey
 from boxplus.formats.output import advice_to_put_back
-from boxplus.formats.trajectory import Trajectory, read_trajectory
+from boxplus.formats.trajectory import Trajectory
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import LocalMap
 from boxplus.maps.tiles.layout import MANIFEST, TileIndex, split_by_tile, tile_folder
@@ -21,13 +21,14 @@ from boxplus.maps.tiles.store import TileStore
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.runs.fleet.recordings import is_recording
 from boxplus.runs.run_folder import RunFolder, run_of_map
+from boxplus.runs.saved_map.map_trajectories import map_trajectories
 from boxplus.runs.saved_map.places import along, over_ground
 from boxplus.runs.saved_map.tiled_points import TiledPoints
 from boxplus.runs.storage.output_folder import doubts_of, program_of
 
 _ROUNDING = 0.01  # m, by which a point may lie outside of its tile
 _TILE = 32.0  # m, in memory, of a cloud from a file
-_WHAT = "a folder of 'boxplus lio' or 'boxplus slam', a map folder with tiles, or a PLY, PCD, LAS, LAZ or E57 file"
+_WHAT = "a folder of 'boxplus lio', 'slam' or 'map merge', a map folder with tiles, or a PLY, PCD, LAS, LAZ or E57 file"
 
 _MAKE_ONE = "make a map of it by 'boxplus slam', and give its output folder"
 
@@ -38,10 +39,10 @@ class SavedMap:
 
     Attributes:
         path: what was opened.
-        kind: "boxplus lio", "boxplus slam", "map folder" or "point cloud".
+        kind: "boxplus lio", "boxplus slam", "boxplus map merge", "map folder" or "point cloud".
         local_maps: places in it; T_odo_map (7,) is the pose of each in the map's frame, z up, and its points are those that can
             be seen from there. Covariances are those of the trajectory, zero for a map without one.
-        trajectory: the poses it was made on, in the map's frame; None for a bare map.
+        trajectories: the poses it was made on, in the map's frame: of a run, or each session of a joint map; none for a bare one.
         voxel: one point per voxel of this edge is given [m].
         origin: (3,) what is counted from, in the coordinates of the file it is from [m]; zero for most, a multiple of 1 km where
             a LAS or LAZ file has coordinates of the Earth.
@@ -53,7 +54,7 @@ class SavedMap:
     path: Path
     kind: str
     local_maps: list[LocalMap]
-    trajectory: Trajectory | None
+    trajectories: list[Trajectory]
     voxel: float
     report: list[str]
     _points: TiledPoints
@@ -68,10 +69,10 @@ class SavedMap:
 
 
 def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> SavedMap:
-    """Open a run's folder, a folder with map tiles, or a PLY, PCD, LAS, LAZ or E57 file, as a map.
+    """Open the folder of a run or of a joint map, a folder with map tiles, or a PLY, PCD, LAS, LAZ or E57 file, as a map.
 
-    Of a run, the (corrected) trajectory says where its local maps are. Without one they stand on a grid over the ground, which is
-    said in `report`. z is taken to be up.
+    Of a run, the (corrected) trajectory says where its local maps are, of a joint map those of its sessions. Without one they
+    stand on a grid over the ground, which is said in `report`. z is taken to be up.
 
     Args:
         config: where local maps are cut, their voxel and range.
@@ -88,7 +89,7 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
         advice = advice_to_put_back(base, base.absolute().parent) or "check the path"
         raise InputError(_WHAT, f"nothing at {base}", advice)
     report, damage, doubts, accepted = list[str](), list[str](), list[str](), list[str]()
-    kind, trajectory, origin = "point cloud", None, np.zeros(3)
+    kind, trajectories, origin = "point cloud", list[Trajectory](), np.zeros(3)
     if base.is_file():
         points, origin = _of_file(base, config.voxel)
         if (run := run_of_map(base)) is not None:
@@ -96,13 +97,14 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
         if origin.any():
             report.append(f"positions in the map are counted from {', '.join(f'{v:.0f}' for v in origin)} m of the file")
     else:
-        tiles, kind, trajectory = _what_is_in(base, report, doubts, accepted)
+        tiles, kind, trajectories = _what_is_in(base, report, doubts, accepted)
         points = _of_tiles(tiles, config.voxel, report, damage)
     if not points.tiles:
         raise InputError("a map with points", f"none in {base}", "; ".join(damage) or "give the map of a run that went through")
-    if trajectory is not None:
-        local_maps = along(trajectory, points.near, config)
-        report.append(f"{len(local_maps)} local maps were computed from the map along its trajectory")
+    if trajectories:
+        local_maps = along(trajectories, points.near, config)
+        way = "its trajectory" if len(trajectories) == 1 else f"the trajectories of its {len(trajectories)} sessions"
+        report.append(f"{len(local_maps)} local maps were computed from the map along {way}")
     else:
         local_maps, spacing = over_ground(points, points.near, config)
         report.append(
@@ -111,46 +113,44 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
         )
     if not local_maps:
         raise InputError("a map with ground to stand on, z up", f"none in {base}", "turn the cloud so that z is up, in metres")
-    return SavedMap(base, kind, local_maps, trajectory, config.voxel, report, points, origin, damage, doubts, accepted)
+    return SavedMap(base, kind, local_maps, trajectories, config.voxel, report, points, origin, damage, doubts, accepted)
 
 
-def _what_is_in(base: Path, report: list[str], doubts: list[str], accepted: list[str]) -> tuple[Path, str, Trajectory | None]:
-    """The folder with the tiles, what wrote it, and the trajectory they were made on."""
+def _what_is_in(base: Path, report: list[str], doubts: list[str], accepted: list[str]) -> tuple[Path, str, list[Trajectory]]:
+    """The folder with the tiles, what wrote it, and the trajectories they were made on."""
     is_bare = (base / MANIFEST).is_file()
     folder = run_of_map(base) if is_bare else RunFolder(base)
     if folder is None:
-        return base, "map folder", None
+        return base, "map folder", []
     if not is_bare and not (folder.tiles / MANIFEST).is_file():
         raise _no_tiles(folder)
     program = program_of(folder.summary) if folder.summary.is_file() else None
-    has_trajectory = folder.trajectory.is_file()
+    trajectories = map_trajectories(folder.path)
+    for trajectory in trajectories:
+        report.extend(trajectory.warnings)
+        trajectory.times  # noqa: B018 - refuses one without times
     if program is not None:
         for kept, texts in zip((doubts, accepted), doubts_of(folder.summary), strict=True):
             kept.extend(texts)
-    if is_bare and has_trajectory:
-        report.append(f"the map belongs to the run in {folder.path}, whose trajectory is used")
-    kind = "map folder" if is_bare and not has_trajectory else program or "map folder"
-    return folder.tiles, kind, _trajectory(folder, report) if has_trajectory else None
+    if is_bare and trajectories:
+        whose = "trajectory is" if len(trajectories) == 1 else "trajectories are"
+        report.append(f"the map belongs to the run in {folder.path}, whose {whose} used")
+    kind = "map folder" if is_bare and not trajectories else program or "map folder"
+    return folder.tiles, kind, trajectories
 
 
 def _no_tiles(folder: RunFolder) -> InputError:
     """What is in place of a map, and what to do about it."""
     advice = advice_to_put_back(folder.tiles)
     if folder.summary.is_file():
-        return InputError(
-            _WHAT, f"a folder of {program_of(folder.summary) or 'a run'!r} without map tiles, {folder.path}",
-            advice or "run without --no-map, or give the folder of a run that wrote a map",
-        )  # fmt: skip
+        program = program_of(folder.summary) or "a run"
+        found = f"a folder of {program!r} without map tiles, {folder.path}"
+        if program == "boxplus map merge":
+            return InputError(_WHAT, f"{found}: no two of its runs met", "give the folder of one of them")
+        return InputError(_WHAT, found, advice or "run without --no-map, or give the folder of a run that wrote a map")
     if is_recording(folder.path):
         return InputError(_WHAT, f"a recording, {folder.path}", _MAKE_ONE)
     return InputError(_WHAT, f"a folder without map tiles, {folder.path}", advice or "give the output folder of a run")
-
-
-def _trajectory(folder: RunFolder, report: list[str]) -> Trajectory:
-    trajectory = read_trajectory(folder.trajectory)
-    report.extend(trajectory.warnings)
-    trajectory.times  # noqa: B018 - refuses one without times
-    return trajectory
 
 
 def _of_tiles(folder: Path, voxel: float, report: list[str], damage: list[str]) -> TiledPoints:

@@ -26,11 +26,15 @@ def run_folder(folder: Path, z_of_second_lap: float = 0.0) -> Path:
     walls = np.column_stack([random.uniform(0.0, 20.0, 20_000), np.repeat([-3.0, 3.0], 10_000), random.uniform(0.3, 4.0, 20_000)])
     with TileWriter(folder / "map", voxel=0.1) as tiles:
         tiles.append(np.concatenate([floor, walls]))
-    with TrajectoryWriter(folder) as writer:
+    write_path(folder, z_of_second_lap)
+    return folder
+
+
+def write_path(folder: Path, z_of_second_lap: float = 0.0, name: str = "trajectory") -> None:
+    with TrajectoryWriter(folder, name) as writer:
         for k in range(60):
             z = 1.8 if k < 30 else 1.8 + z_of_second_lap
             writer.append(10**9 + k * 10**8, np.eye(3), [1.0 + 0.6 * (k % 30), 0.0, z], np.zeros((6, 6)), "ok")
-    return folder
 
 
 def read_heights(folder: Path) -> tuple[np.ndarray, object]:
@@ -41,6 +45,21 @@ def read_heights(folder: Path) -> tuple[np.ndarray, object]:
 def call(*words: object) -> tuple[int, str]:
     result = CliRunner().invoke(app, [str(word) for word in words])
     return result.exit_code, result.output
+
+
+def test_a_joint_map_is_cut_around_the_paths_of_its_sessions(tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "street")
+    for path in folder.glob("trajectory.*"):
+        path.unlink()
+    code, out = call("map", "grid", folder)
+    assert code == 2 and "trajectory" in out  # as no command leaves it
+    (folder / "run.json").write_text('{"program": "boxplus map merge"}')
+    for name in ("monday", "friday"):
+        write_path(folder / "sessions", name=name)
+    for words in (("grid",), ("height",)):
+        code, out = call("map", *words, folder)
+        assert code == 0, out
+    assert (np.asarray(Image.open(folder / "grid.pgm"))[5:-5, 2:-2] == 254).mean() > 0.98
 
 
 def test_floor_plan_and_heights_of_a_run(tmp_path: Path) -> None:

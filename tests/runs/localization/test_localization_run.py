@@ -28,14 +28,19 @@ from boxplus.runs.localization.localization_run import LocalizationResult, run_l
 from boxplus.runs.localization.logs import LOG_COLUMNS, SEARCH_COLUMNS
 from boxplus.runs.localization.summary import LocalizationSummary
 from boxplus.runs.saved_map.saved_map import open_saved_map
+from boxplus.runs.sessions.config import MergeConfig
+from boxplus.runs.sessions.merge_run import merge_runs
+from boxplus.runs.settings_file import load_settings
 from boxplus.runs.storage.row_log import read_row_log
 from boxplus.simulation import SpinningLidar
+from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.live_recording import as_recording
 from boxplus.simulation.motions import trajectories
 from boxplus.simulation.recording_writer import write_recording
 from boxplus.simulation.scenarios import Scenario
 from boxplus.simulation.simulation import Simulation
-from boxplus.simulation.worlds.worlds import yard
+from boxplus.simulation.worlds.worlds import city, yard
+from tests.runs.sessions.runs import written_run
 
 MOUNTING = "odometry.T_imu_lidar=[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 ODOMETRY = ("odometry.scan_voxel=0.5", "odometry.map_cell=0.5", MOUNTING)
@@ -151,6 +156,32 @@ def test_in_the_map_of_another_place_there_is_no_pose(mapped: Path, tmp_path: Pa
     assert summary.best_candidates and all("% of what stands fits" in text for text in summary.best_candidates)
     assert not LocalizationFolder(tmp_path / "out").trajectory.read_text().splitlines()[1:]
     assert "The best candidates, and why not" in draw(tmp_path / "out", result)
+
+
+@pytest.mark.slow
+def test_in_a_joint_map_places_come_from_its_sessions(tmp_path: Path) -> None:
+    """Once it was a bare cloud, with hundreds of places on a grid over its ground."""
+    world, drift = city(2, 2, seed=5), DriftConfig(channels=16, azimuth_steps=240, step_m=2.0)
+    monday = written_run(tmp_path / "monday", world, [[0.0, 0.0], [60.0, 0.0], [60.0, 40.0]], drift, 5)
+    written_run(tmp_path / "friday", world, [[60.0, 95.0], [60.0, 0.0], [10.0, 0.0]], drift, 6)
+    merge_runs(
+        [tmp_path / "monday", tmp_path / "friday"], tmp_path / "street", load_settings(MergeConfig, None, ["map.voxel=0.2"])
+    )
+    saved = open_saved_map(tmp_path / "street")
+    assert saved.kind == "boxplus map merge" and len(saved.trajectories) == 2
+    assert [own.number for own in saved.local_maps] == list(range(len(saved.local_maps))) and len(saved.local_maps) < 20
+    assert (
+        f"{len(saved.local_maps)} local maps were computed from the map along the trajectories of its 2 sessions" in saved.report
+    )
+    # A way where only Friday has been.
+    lidar = SpinningLidar(channels=16, azimuth_steps=250, vertical_fov_deg=(-25.0, 15.0), rate_hz=5.0)
+    way = trajectories.drive(((60.0, 92.0), (60.0, 60.0)), speed=5.0, standstill_s=1.0, seed=2)
+    simulation = Simulation(Scenario("city", world, way, lidar, T_imu_lidar=np.eye(4)), seed=2)
+    summary = run(as_recording(simulation), tmp_path / "out", tmp_path / "street").summary
+    assert summary.found_after_s is not None and not summary.losses and not summary.reasons
+    found = read_trajectory(tmp_path / "out" / "trajectory.csv")
+    truth = se3.compose(se3.inverse(monday.T_world_body[0]), true_poses(simulation, found.times))
+    assert len(found) > 10 and np.linalg.norm(found.p - truth[:, 4:], axis=1).max() < 0.3  # the map itself is off by as much
 
 
 def test_settings() -> None:
