@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 from enum import StrEnum
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from boxplus.cli.own_words import EVALUATION, evaluation_in_options, saying
 from boxplus.errors import InputError
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ class _Plane(StrEnum):
     yz = "yz"
 
 
+@saying(EVALUATION)
 def evaluate_command(
     estimates: Annotated[
         list[Path],
@@ -143,21 +144,28 @@ def evaluate_command(
         right=None if transform_right is None else parse_transform(transform_right, "--transform-right", key=None),
     )
     plane: Plane | None = None if project_to_plane is None else project_to_plane.value
-    one = functools.partial(
-        evaluate,
-        ground_truth=truth,
-        alignment="se3" if align is None else align.value,
-        method="interpolate" if interpolate else "nearest",
-        max_difference_s=max_diff,
-        offset_s=offset,
-        max_gap_s=max_gap,
-        min_matches=min_matches,
-        align_by_first=n_to_align,
-        plane=plane,
-        deltas=_deltas(rpe_distance, rpe_time, rpe_turn, rpe_frames),
-        rpe_pairs=rpe_pairs.value,
-        rpe_path_of="ground_truth" if rpe_path is _Path.truth else "estimate",
-    )
+    deltas = _deltas(rpe_distance, rpe_time, rpe_turn, rpe_frames)
+
+    @saying(EVALUATION)
+    def one(estimate: Trajectory) -> Evaluation:
+        return evaluation_in_options(
+            evaluate(
+                estimate,
+                truth,
+                alignment="se3" if align is None else align.value,
+                method="interpolate" if interpolate else "nearest",
+                max_difference_s=max_diff,
+                offset_s=offset,
+                max_gap_s=max_gap,
+                min_matches=min_matches,
+                align_by_first=n_to_align,
+                plane=plane,
+                deltas=deltas,
+                rpe_pairs=rpe_pairs.value,
+                rpe_path_of="ground_truth" if rpe_path is _Path.truth else "estimate",
+            )
+        )
+
     shown_truth, written = projected(truth, plane), []
     names = short_names(estimates)
     read, unread = {}, {}

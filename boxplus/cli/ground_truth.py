@@ -60,6 +60,7 @@ def compare_with(truth: Trajectory, estimate: Path, evaluation: Path, alignment:
         evaluation: the file to write.
         alignment: of the estimate onto the ground truth: what the estimator leaves open.
     """
+    from boxplus.cli.own_words import EVALUATION, evaluation_in_options, in_options
     from boxplus.evaluation.alignment import UndeterminedAlignmentError
     from boxplus.evaluation.evaluation import evaluate
     from boxplus.formats.output import atomic_file
@@ -75,9 +76,10 @@ def compare_with(truth: Trajectory, estimate: Path, evaluation: Path, alignment:
             found = evaluate(poses, truth, alignment="origin", method="interpolate")
             undetermined = f"compared from the first pose on, not by all positions: expected {error.expected} – got {error.got}"
             found = replace(found, warnings=(*found.warnings, undetermined))
+        found = evaluation_in_options(found)
         figures = found.to_dict()
         with atomic_file(evaluation) as file:
             file.write(f"{json.dumps(figures, indent=2)}\n".encode())
     except BoxplusError as error:
-        return Comparison("not compared, see the error", error=str(error))
+        return Comparison("not compared, see the error", error=in_options(str(error), EVALUATION))
     return Comparison(f"{found.title}: {found.ate.line('m')}", figures)

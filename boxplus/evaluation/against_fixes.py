@@ -126,7 +126,7 @@ def compare_with_fixes(
         raise InputError("a trajectory with times", f"none in {estimate.source}", "give a TUM, EuRoC or CSV file")
     if alignment == "none" and frame is None:
         raise InputError(
-            "the origin of a trajectory in ENU, for --align none",
+            'the origin of a trajectory in ENU, for alignment="none"',
             "none",
             "give a run of 'boxplus slam' with georeference.yaml",
         )
@@ -139,7 +139,7 @@ def compare_with_fixes(
     if len(matched) < max(min_matches, 1):
         raise InputError(
             f"at least {min_matches} fixes within the time of the trajectory", f"{len(matched)} of {len(fixes)}",
-            "check that both have the same clock; --offset shifts the estimate",
+            "check that both have the same clock; offset_s shifts the estimate",
         )  # fmt: skip
     poses = poses[matched]
     p = poses[:, 4:] + quaternion.to_matrix(poses[:, :4]) @ lever

@@ -89,7 +89,9 @@ def align(p_estimate: ArrayLike, p_ground_truth: ArrayLike, kind: PositionAlignm
         return Alignment(kind, np.eye(3), np.zeros(3), 1.0, spread, False)
     if len(x) < 3:
         raise UndeterminedAlignmentError(
-            "at least three matched positions to align", f"{len(x)}", "compare with --align origin or none, or match more poses"
+            "at least three matched positions to align",
+            f"{len(x)}",
+            'compare with alignment="origin" or alignment="none", or match more poses',
         )
     if kind == "yaw":
         return _align_heading(x, y, spread)
@@ -98,14 +100,14 @@ def align(p_estimate: ArrayLike, p_ground_truth: ArrayLike, kind: PositionAlignm
             raise UndeterminedAlignmentError(
                 f"{name} positions that differ, to align by them",
                 f"{len(x)} positions within {values[0]:.1e} m: rotation undetermined",
-                "compare with --align origin, by the first pose, or none",
+                'compare with alignment="origin", by the first pose, or alignment="none"',
             )
         if values[1] < _COLLINEAR * values[0]:
             raise UndeterminedAlignmentError(
                 f"{name} positions off one line, to align by them",
                 f"{len(x)} positions that stray {values[1]:.2g} m from a line of {values[0]:.3g} m (standard deviations): the "
                 "rotation about that line is undetermined",
-                "compare with --align origin, by the first pose, or none",
+                'compare with alignment="origin", by the first pose, or alignment="none"',
             )
     mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
     U, d, Vt = np.linalg.svd((y - mean_y).T @ (x - mean_x) / len(x))
@@ -134,7 +136,7 @@ def _align_heading(x: NDArray[np.float64], y: NDArray[np.float64], spread: NDArr
             raise UndeterminedAlignmentError(
                 f"{name} positions that differ horizontally, to align the heading by them",
                 f"{len(x)} positions within {size:.1e} m of one vertical",
-                "compare with --align origin, by the first pose, or none",
+                'compare with alignment="origin", by the first pose, or alignment="none"',
             )
     angle = float(np.angle(np.vdot(flat_x, flat_y)))
     R = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])

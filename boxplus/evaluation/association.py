@@ -138,13 +138,7 @@ def associate(
     for name, poses in (("estimate", estimate), ("ground_truth", ground_truth)):
         require(poses, Trajectory, f"a Trajectory as {name}", "read it with read_trajectory, or make one from arrays")
     choice(method, ("nearest", "interpolate"), "method")
-    numbers = (max_difference_s, max_gap_s, min_matches, offset_s)
-    if not (all(map(is_finite, numbers)) and min_matches >= 1 and max_difference_s > 0 and max_gap_s > 0):
-        raise InputError(
-            "positive max_difference_s, max_gap_s and min_matches and a finite offset_s",
-            f"{max_difference_s}, {max_gap_s}, {min_matches} and {offset_s}",
-            "correct the settings",
-        )
+    _check_settings(max_difference_s, max_gap_s, min_matches, offset_s)
     if estimate.time_ns is None and ground_truth.time_ns is None:
         return _by_index(estimate, ground_truth, min_matches)
     t_est = estimate.times + round(offset_s * 1e9)
@@ -168,13 +162,13 @@ def associate(
             shifted = t_est + round(offset.offset_s * 1e9)
             find, limit = (_nearest, max_difference_s) if method == "nearest" else (_bracketed, max_gap_s)
             if len(find(shifted, t_gt, round(limit * 1e9))[0]) >= min_matches:
-                hint = f"; the motions suggest --offset {offset_s + offset.offset_s:.3f}"
+                hint = f"; the motions suggest offset_s={offset_s + offset.offset_s:.3f}"
         known = "".join(f"; {warning}" for warning in (*estimate.warnings, *ground_truth.warnings))
         raise InputError(
             f"at least {min_matches} matched poses",
             f"{len(index_est)} of {len(estimate)} ({estimate.source} against {ground_truth.source}, {method}, {outside} outside "
             f"of the ground truth's time{known})",
-            f"raise --max-diff, use --interpolate, or correct the clocks with --offset{hint}",
+            f'raise max_difference_s, use method="interpolate", or correct the clocks with offset_s{hint}',
         )
     within = int(((t_gt >= t_est[0]) & (t_gt <= t_est[-1])).sum())
     used_est, used_gt = len(np.unique(index_est)), len(np.unique(index_gt))
@@ -195,6 +189,14 @@ def associate(
         gaps=_gaps(t_est, t_est[index_est], begin, end),
         time_offset=offset,
     )
+
+
+def _check_settings(max_difference_s: float, max_gap_s: float, min_matches: int, offset_s: float) -> None:
+    for name, value in (("max_difference_s [s]", max_difference_s), ("max_gap_s [s]", max_gap_s), ("min_matches", min_matches)):
+        if not (is_finite(value) and value > 0 and (name != "min_matches" or value >= 1)):
+            raise InputError(f"a positive {name}", f"{value}", "give another one")
+    if not is_finite(offset_s):
+        raise InputError("a finite offset_s [s]", f"{offset_s}", "give another one")
 
 
 def _by_index(estimate: Trajectory, ground_truth: Trajectory, min_matches: int) -> Association:
@@ -219,7 +221,7 @@ def _no_overlap(estimate: Trajectory, ground_truth: Trajectory, offset_s: float)
         for t, name in ((t_est, estimate.source), (t_gt, ground_truth.source))
     ]
     shift = float(t_gt[0] - t_est[0]) * 1e-9
-    advice = f"give the clocks' difference with --offset (equal starts: --offset {shift:.6f})"
+    advice = f"give the clocks' difference with offset_s (equal starts: offset_s={shift:.6f})"
     longer, shorter = max(estimate.duration_s, ground_truth.duration_s), min(estimate.duration_s, ground_truth.duration_s)
     for factor, units in _UNITS.items():
         starts = sorted((abs(float(t_est[0])), abs(float(t_gt[0]))))
@@ -227,7 +229,7 @@ def _no_overlap(estimate: Trajectory, ground_truth: Trajectory, offset_s: float)
         by_length = shorter > 0 and 0.5 < longer / shorter / factor < 2.0
         if by_start or by_length:
             advice = f"the stamps differ by a factor of about {factor:.0e}: {units}? correct the unit of one file"
-    got = " and ".join(spans) + (f", after --offset {offset_s}" if offset_s else "")
+    got = " and ".join(spans) + (f", after offset_s={offset_s}" if offset_s else "")
     return InputError("two trajectories that overlap in time", got, advice)
 
 

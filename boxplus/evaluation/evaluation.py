@@ -302,7 +302,7 @@ def _find_alignment(association: Association, kind: AlignmentKind, first: int | 
         return align_origin(estimate, truth)
     if first is not None and not (is_finite(first) and first == int(first) and 3 <= first <= len(association)):
         raise InputError(
-            f"3 to {len(association)} matched poses to align by", shown(first), "choose another number, or leave --n-to-align out"
+            f"3 to {len(association)} matched poses to align by", shown(first), "choose another align_by_first, or leave it out"
         )
     return align(estimate.p[:first], truth.p[:first], kind)
 
@@ -330,7 +330,7 @@ def _refuse_other_unit(estimate: Trajectory, ground_truth: Trajectory) -> None:
         raise InputError(
             "positions in metres in both files",
             f"an estimate 10^{power} times the size of the ground truth ({sizes[0]:.4g} and {sizes[1]:.4g}, standard deviations)",
-            "convert the one in centimetres, millimetres or kilometres, or compare with --align sim3",
+            'convert the one in centimetres, millimetres or kilometres, or compare with alignment="sim3"',
         )
 
 

@@ -38,11 +38,9 @@ class Delta:
 
     def __post_init__(self) -> None:
         if not 0 < self.value < 1e9 or (self.unit == "frames" and self.value != int(self.value)):
-            raise InputError(
-                "a positive delta of relative errors, a whole number of frames",
-                str(self),
-                "choose another one, or leave it out",
-            )
+            number = "whole number" if self.unit == "frames" else "number"
+            expected = f'a positive {number} in Delta(value, "{self.unit}")'
+            raise InputError(expected, str(self), "choose another one, or leave it out")
 
     def __str__(self) -> str:
         return f"{self.value:g}°" if self.unit == "deg" else f"{self.value:g} {self.unit}"
@@ -119,7 +117,9 @@ def pairs_by_turn(R: NDArray[np.float64], delta_rad: float, pairs: Pairs = "cons
         count += len(j)
         if count > _MOST_PAIRS:
             raise InputError(
-                f"at most {_MOST_PAIRS:,} pairs of poses {delta_rad:g} rad apart", "more", "use consecutive pairs, or fewer poses"
+                f"at most {_MOST_PAIRS:,} pairs of poses {delta_rad:g} rad apart",
+                "more",
+                'use pairs="consecutive", or fewer poses',
             )
         found.append(np.stack([np.full(len(j), i), j], axis=1))
     return np.concatenate([np.empty((0, 2), np.intp), *found])
@@ -211,7 +211,8 @@ def relative_errors(
     else:
         rows, whole = pairs_by_frames(len(measured), int(delta.value), pairs), f"{len(measured)} poses"
     if not len(rows):
-        raise InputError(f"poses {delta} apart", f"a matched trajectory of {whole}", "use a smaller delta")
+        smaller = f'use a smaller Delta(value, "{delta.unit}")'
+        raise InputError(f"poses {delta} apart", f"a matched trajectory of {whole}", smaller)
     i, j = rows.T
     t_est, R_est = _relative(estimate, i, j)
     t_gt, R_gt = _relative(ground_truth, i, j)

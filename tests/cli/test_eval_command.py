@@ -128,3 +128,27 @@ def test_swapped_arguments_are_noticed(files: tuple[str, str], tmp_path: Path) -
         assert "estimated trajectories first, the ground truth last" in str(swapped.exception)
     against = CliRunner().invoke(app, [*files, str(tmp_path / "drive.bag")])
     assert "one estimate, its places alone, against positions by satellite – got another one" in str(against.exception)
+
+
+def test_what_is_refused_names_options_of_the_command(files: tuple[str, str], tmp_path: Path) -> None:
+    path = read_trajectory(files[1])
+    write_tum(tmp_path / "between.tum", Trajectory(path.times + 50_000_000, path.p, path.q_wxyz))
+    write_tum(tmp_path / "line.tum", Trajectory(path.times, path.p * [1.0, 0.0, 0.0], path.q_wxyz))
+    between, line = str(tmp_path / "between.tum"), str(tmp_path / "line.tum")
+    for words, expected in (
+        ([*files, "--max-diff", "0"], "expected a positive --max-diff [s] – got 0.0 – "),
+        ([*files, "--interpolate", "--max-gap", "-1"], "expected a positive --max-gap [s] – got -1.0 – "),
+        ([*files, "--rpe-distance", "-1"], "expected a positive number in --rpe-distance – got -1 m – "),
+        ([*files, "--offset", "100"], "give the clocks' difference with --offset (equal starts: --offset "),
+        (
+            [between, files[1]],
+            "– raise --max-diff, use --interpolate, or correct the clocks with --offset; the motions suggest --off",
+        ),
+        ([line, files[1]], "– compare with --align origin, by the first pose, or --align none"),
+        ([*files, "--n-to-align", "1000"], "choose another --n-to-align, or leave it out"),
+    ):
+        assert expected in str(CliRunner().invoke(app, words).exception)
+    shown = CliRunner().invoke(app, [*files, "--rpe-distance", "10000"]).output
+    assert "use a smaller --rpe-distance" in shown
+    several = CliRunner().invoke(app, [files[0], between, files[1]]).output
+    assert "between: not compared, expected at least 10 matched poses" in several and "raise --max-diff" in several

@@ -173,7 +173,7 @@ def test_no_overlap_says_which_offset_would_make_them_start_together() -> None:
     with pytest.raises(
         InputError,
         match=r"expected two trajectories that overlap in time – got 0\.000 … 19\.990 s \(estimate\.tum\) and 1500000000\.000 … "
-        r"1500000019\.990 s \(path\) – give the clocks' difference with --offset \(equal starts: --offset 1500000000\.000000\)",
+        r"1500000019\.990 s \(path\) – give the clocks' difference with offset_s \(equal starts: offset_s=1500000000\.000000\)",
     ):
         associate(shifted(truth, 0), truth)
 
@@ -189,7 +189,7 @@ def test_another_unit_of_time_is_suspected(factor: float, word: str) -> None:
 def test_too_few_matches_are_refused_with_a_hint() -> None:
     path = SmoothPath(0)
     truth = path.sample(np.arange(0.0, 20.0, 0.5))
-    with pytest.raises(InputError, match=r"at least 10 matched poses – got 0 of 39 .* – raise --max-diff, use --interpolate"):
+    with pytest.raises(InputError, match=r"at least 10 matched poses – got 0 of 39 .* – raise max_difference_s, use method="):
         associate(path.sample(np.arange(0.25, 19.6, 0.5)), truth)
     with pytest.raises(InputError, match=r"got 1 of 1 "):
         associate(path.sample(np.array([5.0])), truth)
@@ -209,9 +209,11 @@ def test_trajectories_without_stamps_go_by_index() -> None:
 
 def test_settings_are_checked() -> None:
     path = SmoothPath(0).sample(np.arange(0.0, 20.0, 0.5))
-    for wrong in ({"max_difference_s": 0.0}, {"max_difference_s": np.nan}, {"offset_s": np.inf}, {"min_matches": 0}):
-        with pytest.raises(InputError, match="positive max_difference_s"):
-            associate(path, path, **wrong)
+    for name, value in (("max_difference_s", 0.0), ("max_difference_s", np.nan), ("max_gap_s", -1.0), ("min_matches", 0)):
+        with pytest.raises(InputError, match=f"a positive {name}.* – got {value} – "):
+            associate(path, path, **{name: value})
+    with pytest.raises(InputError, match="a finite offset_s"):
+        associate(path, path, offset_s=np.inf)
 
 
 def _walked_in_circles(late_s: float, seed: int) -> tuple[Trajectory, Trajectory]:
