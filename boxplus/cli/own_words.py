@@ -30,6 +30,9 @@ EVALUATION: Mapping[str, str] = {
 }
 """Patterns of what `evaluate` takes, and the options of `boxplus eval`."""
 
+POSE_GRAPH: Mapping[str, str] = {r"\bignore_unknown\b": "--ignore-unknown"}
+"""The same of `read_pose_graph` and `boxplus pgo`."""
+
 
 def in_options(text: str, options: Mapping[str, str]) -> str:
     """The text with options in the place of arguments.

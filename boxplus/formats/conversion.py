@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_file import CLOUD_ENDINGS, cloud_writer, read_cloud
 from boxplus.formats.graphs.pose_graph_file import read_pose_graph, write_pose_graph
+from boxplus.formats.numbers.lines import first_text
 from boxplus.formats.reconstructions.bal import BalProblem, write_bal
 from boxplus.formats.reconstructions.between_formats import bal_of, colmap_of
 from boxplus.formats.reconstructions.colmap import write_colmap
 from boxplus.formats.reconstructions.colmap_model import ColmapModel
 from boxplus.formats.reconstructions.reconstruction import read_reconstruction
 from boxplus.formats.trajectory import read_trajectory, write_csv, write_kitti, write_tum
-from boxplus.formats.trajectory_rows import detect_format
+from boxplus.formats.trajectory_rows import detect_format, is_header, parse_row
 
 Target = Literal["tum", "kitti", "csv", "cloud", "g2o", "toro", "colmap-text", "colmap-binary", "bal"]
 
 _TRAJECTORIES = {"tum": write_tum, "kitti": write_kitti, "csv": write_csv}
 _LOST = {"tum": ("covariances", "status"), "kitti": ("stamps", "covariances", "status"), "csv": ()}
+_RECORDINGS = (".bag", ".mcap", ".db3", ".pcap")
+_LOOKED_AT = 1 << 16  # bytes, for what kind of thing a file holds
+_ReadT = TypeVar("_ReadT")
 _OF_ENDINGS: dict[str, Target] = {
     ".tum": "tum",
     ".csv": "csv",
@@ -55,7 +60,7 @@ def convert(source: str | Path, output: str | Path, to: Target | Literal["auto"]
     if target.exists():
         raise InputError("a new output", f"{target}, which exists", "give another name, or remove it")
     if to in _TRAJECTORIES:
-        trajectory = read_trajectory(path)
+        trajectory = _read(read_trajectory, path, "a trajectory", to)
         _TRAJECTORIES[to](target, trajectory)
         has = {
             "stamps": trajectory.time_ns is not None,
@@ -71,11 +76,48 @@ def convert(source: str | Path, output: str | Path, to: Target | Literal["auto"]
             writer.append(cloud.points, cloud.intensity, {name: cloud.columns[name] for name in cloud.columns if name in held})
         return _sentence(f"{len(cloud):,} points", [*(set(cloud.columns) - held), *cloud.left_out], ())
     if to in ("g2o", "toro"):
-        graph = read_pose_graph(path)
+        graph = _read(read_pose_graph, path, "a pose graph", to)
         write_pose_graph(target, graph, "g2o" if to == "g2o" else "toro")
         lost = [f"{len(graph.fixed)} FIX"] if to == "toro" and len(graph.fixed) else []
         return _sentence(f"{len(graph.ids):,} poses, {len(graph.edges):,} edges", lost, graph.warnings)
     return _convert_reconstruction(path, target, to)
+
+
+def _read(read: Callable[[Path], _ReadT], source: Path, kind: str, to: str) -> _ReadT:
+    """What the source holds; where it holds another kind of thing that is said, as no option makes it this one."""
+    try:
+        return read(source)
+    except InputError as error:
+        other = _kind(source)
+        if other not in ("", kind):
+            raise InputError(
+                f"{kind}, to be written as {to}", f"{source}, {other}", "name an output of the same kind, or give another source"
+            ) from error
+        if "ignore_unknown" in error.advice:
+            advice = "check that it is a pose graph, and take other lines out: a graph is converted as a whole"
+            raise InputError(error.expected, error.got, advice) from error
+        raise
+
+
+def _kind(source: Path) -> str:
+    """What a file seems to hold, or nothing where that cannot be told."""
+    if source.is_dir() or not source.is_file():
+        return "a folder" if source.is_dir() else ""
+    if source.suffix.lower() in _RECORDINGS:
+        return "a recording"
+    if source.suffix.lower() in CLOUD_ENDINGS:
+        return "a point cloud"
+    lines = (line.strip() for line in first_text(source, _LOOKED_AT).splitlines())
+    first = next((line for line in lines if line and not line.startswith("#")), "")
+    if first.startswith(("VERTEX", "EDGE")):
+        return "a pose graph"
+    try:
+        layout = detect_format(first, str(source))
+        if not is_header(first):
+            parse_row(first, layout)
+    except (InputError, ValueError):
+        return ""
+    return "a trajectory"
 
 
 def _convert_reconstruction(source: Path, target: Path, to: Target) -> str:

@@ -155,10 +155,11 @@ def detect_format(first_line: str, source: str) -> Format:
             return "tum"
         if count == 12:
             return "kitti"
+    is_binary = any(character == "\ufffd" or (ord(character) < 32 and character != "\t") for character in first_line)
     raise InputError(
         "a trajectory in TUM (8 columns), KITTI (12 columns), EuRoC or boxplus CSV (comma-separated) format",
-        f"the line {first_line[:60]!r} ({source})",
-        "convert the file or name its format with --format",
+        f"binary data ({source})" if is_binary else f"the line {first_line[:60]!r} ({source})",
+        "give a file in one of these formats",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -233,3 +234,24 @@ def test_a_file_of_the_graph_processor_is_converted_too(tmp_path: Path) -> None:
     told = convert(tmp_path / "a.txt", tmp_path / "b.txt", "bal")
     assert told.endswith("without the cameras that images share (each image has its own now) of the source")
     assert len(read_bal(tmp_path / "b.txt").cameras) == len(given.T_camera_world)
+
+
+def test_a_source_of_another_kind_is_named_without_options_of_other_commands(tmp_path: Path) -> None:
+    write_small_files(tmp_path)
+    q = np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
+    write_csv(tmp_path / "path.csv", Trajectory(10**9 * np.arange(3), np.zeros((3, 3)), q))
+    convert(tmp_path / "path.csv", tmp_path / "path.tum")
+    (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\nE\x00\x00\x00\x0c\x00\x00\x00conn_count=\x01\x00\x00\x00")
+    (tmp_path / "bytes.txt").write_bytes(b"\x02\x01\xfe no trajectory\n")
+    (tmp_path / "more.g2o").write_text("VERTEX_XY 5 1 2\n")
+    for source, output, said in (
+        ("path.tum", "a.g2o", r"a pose graph, to be written as g2o – got \S+path.tum, a trajectory – name an output of the same"),
+        ("path.csv", "a.graph", r"a pose graph, to be written as toro – got \S+path.csv, a trajectory – "),
+        ("drive.bag", "a.csv", r"a trajectory, to be written as csv – got \S+drive.bag, a recording – "),
+        ("loops.g2o", "a.tum", r"a trajectory, to be written as tum – got \S+loops.g2o, a pose graph – "),
+        ("bytes.txt", "a.tum", r"boxplus CSV \(comma-separated\) format – got binary data \(\S+\) – give a file in one of these"),
+        ("more.g2o", "a.graph", r"got 'VERTEX_XY 5 1 2' .* – check that it is a pose graph, and take other lines out"),
+    ):
+        result = CliRunner().invoke(app, ["convert", str(tmp_path / source), str(tmp_path / output)])
+        assert result.exit_code == 2 and re.search(said, result.stderr), result.stderr
+        assert "--" not in result.stderr and "\\x" not in result.stderr

@@ -22,6 +22,7 @@ from boxplus.cli.optimization.terminal import (
     TimeLimitOption,
 )
 from boxplus.cli.options import JsonOption, NoReportOption, OverwriteOption, QuietOption, ThreadsOption
+from boxplus.cli.own_words import POSE_GRAPH, saying
 from boxplus.cli.viewing import ViewOption, viewing
 from boxplus.errors import InputError
 
@@ -156,9 +157,10 @@ def pgo(
             if file.is_dir():
                 raise InputError("a pose graph file, g2o or TORO", f"the folder {file}", "give a file in it")
             kind = graph_format(file)
-            graph = read_pose_graph(
-                file, rotation_error=rotation_error.value, cross_block=cross_block.value, ignore_unknown=ignore_unknown
-            )
+            with saying(POSE_GRAPH):
+                graph = read_pose_graph(
+                    file, rotation_error=rotation_error.value, cross_block=cross_block.value, ignore_unknown=ignore_unknown
+                )
         files, folders = _own_files(folder)
         stack.enter_context(output_folder(folder, "boxplus pgo", lambda: files, lambda: folders, overwrite=overwrite))
         name = "optimized.g2o" if kind == "g2o" else "optimized.graph"

@@ -74,7 +74,7 @@ class GraphBuilder:
                 chunk.fail(
                     int(row),
                     "a line that begins with " + ", ".join(self._known[:-1]) + f" or {self._known[-1]}",
-                    "check that it is a pose graph; ignore_unknown (--ignore-unknown) leaves other lines out and counts them",
+                    "check that it is a pose graph; ignore_unknown leaves other lines out and counts them",
                 )
             word = chunk.line(int(row)).split()[0]
             times, first = self._unknown.get(word, (0, int(chunk.number[row])))

@@ -159,6 +159,8 @@ def test_unknown_lines_are_left_out_on_request_and_counted(tmp_path: Path) -> No
     write_g2o(tmp_path / "loops.g2o", loop_graph(2))
     with (tmp_path / "loops.g2o").open("a") as file:
         file.write("EDGE_XY 0 1 2 3\n")
+    refused = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--no-report")
+    assert "pose graph; --ignore-unknown leaves other lines out" in refused.stderr
     result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--ignore-unknown", "--no-report")
     assert result.exit_code == 0, result.output
     assert "warning: 1 line EDGE_XY was left out" in words(result)
