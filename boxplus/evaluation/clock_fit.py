@@ -3,7 +3,9 @@
 Where stamps of an estimate lack τ it lies, but for its frame and its scale, at p(t + τ) ≈ p(t) + τ v(t) of the ground truth. So τ
 is a regression of what is left after an alignment on the velocity. Both are cut into stretches with an alignment each, which
 takes drift away, and what τ becomes without one of the stretches in turn says how well it is known, whatever the errors are
-(jackknife). Slow motion, noise and drift show in that, where a formula for white noise would promise milliseconds.
+(jackknife). Slow motion, noise and drift show in that, where a formula for white noise would promise milliseconds. What lasts
+longer than a stretch shows as two in a row are left out together; what turns have, and places do not, or the other way round,
+as their offsets are held against each other (`ClockFit.together`).
 """
 
 from __future__ import annotations
@@ -33,6 +35,8 @@ _GAP_S, _GAP_STEPS = 0.25, 5.0  # and that of median steps: what is farther apar
 _STEPS, _SETTLED_S = 10, 1e-5
 # Standard deviations, and times (of squares), by which an offset fits worse than another that refutes it.
 _CLEARLY, _WORSE = 4.0, 2.0
+_OTHER_S = 0.1  # between the offsets of two signals, from which on they are not those of one clock
+_AGREE = 1.5  # standard deviations, by which two signals differ without an error of their own
 _ROUNDING = 1e-9  # of the squared slopes, that an alignment leaves of those it explains
 
 
@@ -44,13 +48,31 @@ class ClockFit:
         offset_s: to be added to the stamps of the estimate [s].
         deviation_s: its standard deviation, by the jackknife over stretches [s].
         correlation: of the aligned motions at that offset, at most 1.
-        signal: `rotation` or `translation`.
+        signal: `rotation` or `translation`, or both.
     """
 
     offset_s: float
     deviation_s: float
     correlation: float
     signal: str
+
+    @classmethod
+    def together(cls, fits: list[ClockFit]) -> ClockFit | None:
+        """What both signals tell, weighted; where they contradict each other one is off by an error that no stretch shows.
+
+        Nothing tells which: half of the square by which their difference exceeds what they know, as DerSimonian and Laird (1986)
+        have it, is added to the variance. Offsets far apart are two, of motion that repeats itself: the better known counts.
+        """
+        best = sorted(fits, key=lambda fit: fit.deviation_s)
+        if len(best) < 2 or abs(best[0].offset_s - best[1].offset_s) > _OTHER_S:
+            return best[0] if best else None
+        first, second = best
+        known = first.deviation_s**2 + second.deviation_s**2
+        beside = max(0.0, 0.5 * ((first.offset_s - second.offset_s) ** 2 - _AGREE**2 * known))
+        share = first.deviation_s**2 / known if known > 0.0 else 0.0
+        offset_s = (1.0 - share) * first.offset_s + share * second.offset_s
+        deviation_s = math.sqrt(share * second.deviation_s**2 + beside)
+        return cls(offset_s, deviation_s, first.correlation, f"{first.signal} and {second.signal}")
 
 
 class MotionPair:
@@ -125,7 +147,11 @@ class MotionPair:
                 return None
             if abs(step) < _SETTLED_S:
                 break
-        deviation = jackknife(np.array([one.pull for one in stretches]), np.array([one.told for one in stretches]))
+        pull, told_by = (np.array([getattr(one, name) for one in stretches]) for name in ("pull", "told"))
+        deviation = jackknife(pull, told_by)
+        if len(stretches) >= 2 * LEAST_STRETCHES:  # errors that last longer than one
+            pairs = np.arange(0, len(stretches), 2)
+            deviation = max(deviation, jackknife(np.add.reduceat(pull, pairs), np.add.reduceat(told_by, pairs)))
         # Slopes of noise alone, as of a circle at constant speed, where a turn is an offset, scatter less than they know.
         deviation = max(deviation, _white_deviation(stretches))
         if not math.isfinite(deviation) or abs(step) > 0.1 * deviation:

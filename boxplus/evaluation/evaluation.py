@@ -18,7 +18,7 @@ from boxplus.errors import InputError
 from boxplus.evaluation.alignment import Alignment, AlignmentKind, align, align_origin, principal_spread
 from boxplus.evaluation.association import Association, associate
 from boxplus.evaluation.ate import rotation_differences, translation_errors
-from boxplus.evaluation.clock_rate import ClockRate
+from boxplus.evaluation.doubts.clocks import clock_doubts
 from boxplus.evaluation.doubts.incidents import incident_doubts, jump_doubts
 from boxplus.evaluation.doubts.other_meanings import alignment_doubts, reading_doubts
 from boxplus.evaluation.doubts.rounded_positions import rounded_position_doubts
@@ -26,7 +26,6 @@ from boxplus.evaluation.doubts.rounded_stamps import rounding_doubts
 from boxplus.evaluation.frames import Plane, projected
 from boxplus.evaluation.rpe import Delta, Pairs, RelativeErrors, relative_errors
 from boxplus.evaluation.statistics import Statistics, rms
-from boxplus.evaluation.time_offset import TimeOffset
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import so3
 
@@ -42,10 +41,6 @@ _KINDS = {
 }
 _NAMED_TRUTH = re.compile(r"(^|[^a-z])(gt|ground_?-?truth|truth)([^a-z]|$)", re.IGNORECASE)
 _NAMES_OF_RUNS = ("trajectory.tum", "trajectory.csv", "trajectory.kitti.txt")
-# Between clocks, and of the longer interval between poses; less is worth a word only where it makes the errors far smaller.
-_NOTICED_OFFSET_S, _OF_INTERVAL = 0.02, 0.2
-_FAR_BETTER = 0.8  # times the error of now, from which on an offset is told whatever motions say; as much worse refutes it
-_BETTER = 0.99  # times the error of now, what an offset has to reach to be advised
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,21 +247,8 @@ def evaluate(
     warnings = [*_order_doubts(estimate, ground_truth), *estimate.warnings, *ground_truth.warnings]
     warnings += _association_doubts(association, estimate, ground_truth)
     warnings += jump_doubts(estimate, ground_truth)
-    noticed = association.time_offset
-    by_rate = None
-    if noticed is not None and noticed.rate is not None and noticed.rate.shows:
-        on_time = replace(estimate, time_ns=noticed.rate.corrected(estimate.times + round(offset_s * 1e9)), lines=None)
-        by_rate = _rate_doubt(
-            noticed.rate, rms(translation), error_with(estimate, offset_s + noticed.offset_s), error_with(on_time, 0.0)
-        )
-    if by_rate is not None:
-        warnings.append(by_rate)
-    elif noticed is not None and (abs(noticed.offset_s) > _NOTICED_OFFSET_S or noticed.shows):
-        rmse_with = error_with(estimate, association.offset_s + noticed.offset_s)
-        gain = 1.0 if rmse_with is None else rms(translation) / max(rmse_with, 1e-300)
-        if gain > 1.0 / _FAR_BETTER or (gain > _FAR_BETTER and _is_told(noticed, estimate, ground_truth)):
-            warnings.append(_clock_doubt(noticed, association.offset_s + noticed.offset_s, rms(translation), rmse_with))
     warnings += [
+        *clock_doubts(association, estimate, ground_truth, rms(translation), error_with),
         *alignment_doubts(association, transform, translation, rotation),
         *reading_doubts(association, transform, translation),
         *incident_doubts(aligned, truth, translation),
@@ -362,33 +344,3 @@ def _is_of_sparse_truth(association: Association, ground_truth: Trajectory) -> b
         return False
     longest_s = max((end - begin for begin, end in association.gaps), default=0.0)
     return longest_s < 5.0e-9 * float(np.median(np.diff(ground_truth.times)))
-
-
-def _is_told(found: TimeOffset, estimate: Trajectory, ground_truth: Trajectory) -> bool:
-    """Whether an offset is worth a word even if the errors hardly change with it."""
-    interval_s = max(float(np.median(np.diff(poses.times))) * 1e-9 for poses in (estimate, ground_truth))
-    return found.shows and abs(found.offset_s) > max(_NOTICED_OFFSET_S, _OF_INTERVAL * interval_s)
-
-
-def _rate_doubt(found: ClockRate, rmse: float, with_offset: float | None, with_rate: float | None) -> str | None:
-    """A sentence on a rate with which the errors do get smaller, than they are and than an offset alone makes them."""
-    least = rmse if with_offset is None else min(rmse, with_offset)
-    far_apart = abs(found.rate) * found.half_s > _NOTICED_OFFSET_S
-    if with_rate is None or not with_rate < (_BETTER if far_apart else _FAR_BETTER) * least:
-        return None
-    beside = "" if with_offset is None else f", and {with_offset:.4g} m with a constant offset"
-    return (
-        f"the clocks do not run at the same rate: {found}; with stamps t {found.offset_s:+.4f} s {found.rate:+.4g} "
-        f"(t − {found.middle_ns * 1e-9:.3f} s) the ATE is {with_rate:.4g} m instead of {rmse:.4g} m{beside}"
-    )
-
-
-def _clock_doubt(found: TimeOffset, offset_s: float, rmse: float, rmse_with: float | None) -> str:
-    """An offset is advised only where the errors do get smaller with it."""
-    known = f"correlation {found.correlation:.3f}{found.repetition}"
-    motions = f"the motions fit best with {found} added to the estimate's stamps ({known})"
-    if rmse_with is None:
-        return f"{motions}, but the poses cannot be compared with that: no offset is advised"
-    if rmse_with < _BETTER * rmse:
-        return f"{motions}: with --offset {offset_s:.3f} the ATE is {rmse_with:.4g} m instead of {rmse:.4g} m"
-    return f"{motions}, but the ATE is no better with that ({rmse_with:.4g} m, now {rmse:.4g} m): no offset is advised"

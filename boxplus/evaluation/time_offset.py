@@ -40,8 +40,8 @@ class TimeOffset:
     Attributes:
         offset_s: to be added to the stamps of the estimate [s].
         correlation: normalised correlation of the two motions at that offset, at most 1.
-        signal: `rotation` or `translation`: which motion tells it.
-        deviation_s: standard deviation of the offset, as it scatters over the stretches of the path [s].
+        signal: `rotation`, `translation` or both: which motion tells it.
+        deviation_s: standard deviation of the offset, as it scatters over the stretches of the path and between the signals [s].
         others_s: offsets that fit as well, as the motion repeats itself, in order of their size [s].
         rate: of the clocks against each other, found together with an offset; None where the motions do not tell it.
     """
@@ -82,12 +82,12 @@ def estimate_time_offset(
 ) -> TimeOffset | None:
     """Correlate the speeds of both trajectories within ±2 s and within ±60 s, hold what fits against the motions, and refine.
 
-    Speeds (of rotation and of translation) do not depend on the frames of the trajectories, and the normalised correlation
-    not on their scale. Motion that repeats itself (laps, steps) correlates at every period: of all offsets that correlate those
-    are dropped whose motions or places are clearly farther apart than another's, and of the rest, which nothing tells apart, the
-    smallest is taken. From there a regression on the velocities, stretch by stretch, finds offset and deviation. The signal
-    that knows the offset better counts. Where slow motion leaves nothing to correlate, but the places are alike, the regression
-    is begun everywhere within ±2 s.
+    Speeds (of rotation and of translation) do not depend on the frames of the trajectories, and the normalised correlation not
+    on their scale. Motion that repeats itself (laps, steps) correlates at every period: of all offsets that correlate those are
+    dropped whose motions or places are clearly farther apart than another's, and of the rest, which nothing tells apart, the
+    smallest is taken. From there a regression on the velocities, stretch by stretch, finds offset and deviation. Both signals
+    count, each as well as it knows the offset. Where slow motion leaves nothing to correlate, but the places are alike, the
+    regression is begun everywhere within ±2 s.
 
     Args:
         t_estimate, t_ground_truth: (N,) int64 stamps to use [ns], in the place of the trajectories' own.
@@ -121,9 +121,8 @@ def estimate_time_offset(
 
 
 def _refined(pair: MotionPair, start_s: float) -> ClockFit | None:
-    """The offset near another one, by the signal that knows it best."""
-    fits = [fit for signal in pair.signals if (fit := pair.fit(signal, start_s, _AROUND_S)) is not None]
-    return min(fits, key=lambda fit: fit.deviation_s, default=None)
+    """The offset near another one, by both signals."""
+    return ClockFit.together([fit for signal in pair.signals if (fit := pair.fit(signal, start_s, _AROUND_S)) is not None])
 
 
 def _told(pair: MotionPair, coarse: TimeOffset) -> TimeOffset:
