@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
@@ -13,12 +15,17 @@ from boxplus.cli.own_words import EVALUATION, evaluation_in_options, saying
 from boxplus.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from boxplus.evaluation.against_fixes import FixComparison
     from boxplus.evaluation.alignment import PositionAlignment
     from boxplus.evaluation.evaluation import Evaluation
     from boxplus.evaluation.frames import Plane
     from boxplus.evaluation.rpe import Delta, Unit
     from boxplus.formats.trajectory import Trajectory
+
+_SAME_COSINES = 2.9988  # trace of a rotation by less than 2 degrees, which is told of no body frame
 
 
 class _Alignment(StrEnum):
@@ -138,17 +145,15 @@ def evaluate_command(
         comparison = _against_fixes(paths[0], estimated, ground_truth, gnss_topic, gnss_lever_arm, align, offset, min_matches)
         typer.echo(json.dumps(comparison.to_dict(), indent=2) if as_json else comparison.summary())
         return
-    truth = transformed(
-        read_trajectory(ground_truth, ground_truth_format.value),
-        left=None if transform_left is None else parse_transform(transform_left, "--transform-left", key=None),
-        right=None if transform_right is None else parse_transform(transform_right, "--transform-right", key=None),
-    )
+    left = None if transform_left is None else parse_transform(transform_left, "--transform-left", key=None)
+    right = None if transform_right is None else parse_transform(transform_right, "--transform-right", key=None)
+    truth = transformed(read_trajectory(ground_truth, ground_truth_format.value), left=left, right=right)
     plane: Plane | None = None if project_to_plane is None else project_to_plane.value
     deltas = _deltas(rpe_distance, rpe_time, rpe_turn, rpe_frames)
 
     @saying(EVALUATION)
     def one(estimate: Trajectory) -> Evaluation:
-        return evaluation_in_options(
+        found = evaluation_in_options(
             evaluate(
                 estimate,
                 truth,
@@ -165,6 +170,7 @@ def evaluate_command(
                 rpe_path_of="ground_truth" if rpe_path is _Path.truth else "estimate",
             )
         )
+        return found if right is None else replace(found, warnings=tuple(_with_given(text, right) for text in found.warnings))
 
     shown_truth, written = projected(truth, plane), []
     names = short_names(estimates)
@@ -213,6 +219,18 @@ def _trajectory_file(path: Path) -> Path:
             "give the trajectory itself; a recording with positions comes last: boxplus eval TRAJECTORY RECORDING",
         )
     return path
+
+
+def _with_given(warning: str, right: NDArray[np.float64]) -> str:
+    """The warning with another pose of the body that it gives put together with the one (4, 4) that was given."""
+    from boxplus.runs.transform import parse_transform, transform_text
+
+    def together(found: re.Match[str]) -> str:
+        T = right @ parse_transform(found[1], "--transform-right", key=None)
+        is_none = T[:3, :3].trace() > _SAME_COSINES and (T[:3, 3] ** 2).sum() < 0.01 * max((right[:3, 3] ** 2).sum(), 1e-4)
+        return "--transform-right left out" if is_none else f"--transform-right '{transform_text(T)}' in place of the one given"
+
+    return re.sub(r"--transform-right '([^']+)'", together, warning)
 
 
 def _deltas(distance_m: float, time_s: float, turn_deg: float, frames: int) -> list[Delta]:

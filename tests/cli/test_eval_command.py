@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from boxplus.cli.eval import evaluate_command
 from boxplus.errors import InputError
 from boxplus.evaluation.frames import transformed
 from boxplus.formats.trajectory import Trajectory, read_trajectory, write_csv, write_tum
+from boxplus.manifolds import quaternion, so3
+from boxplus.runs.transform import parse_transform
 
 app = typer.Typer()
 app.command()(evaluate_command)
@@ -152,3 +155,26 @@ def test_what_is_refused_names_options_of_the_command(files: tuple[str, str], tm
     assert "use a smaller --rpe-distance" in shown
     several = CliRunner().invoke(app, [files[0], between, files[1]]).output
     assert "between: not compared, expected at least 10 matched poses" in several and "raise --max-diff" in several
+
+
+@pytest.mark.parametrize("wanted", ["xyz: 0 0 0", "xyz_rpy_deg: 0.2 0 0 0 0 30", "xyz: 0 0.5 0"])
+@pytest.mark.parametrize("given", ["xyz_rpy_deg: 0 0 0 0 0 90", "xyz: 0.4 -0.3 0.6"])
+def test_a_pose_of_the_body_that_was_given_is_part_of_what_is_advised(
+    files: tuple[str, str], tmp_path: Path, given: str, wanted: str
+) -> None:
+    path = read_trajectory(files[1])
+    turning = so3.exp(np.stack([np.sin(path.times * 1e-9), np.cos(0.7 * path.times * 1e-9), path.times * 1e-10], axis=1))
+    truth = Trajectory(path.times, path.p, quaternion.from_matrix(turning))
+    write_tum(tmp_path / "truth.tum", truth)
+    write_tum(tmp_path / "run.tum", transformed(truth, right=parse_transform(wanted)))
+    arguments = [str(tmp_path / "run.tum"), str(tmp_path / "truth.tum"), "--json", "--transform-right"]
+    errors, advised = [], given
+    for _ in range(3):  # first the turn, then the lever
+        result = json.loads(CliRunner().invoke(app, [*arguments, advised]).stdout)
+        errors.append((result["ate_translation_m"]["rmse"], result["ate_rotation_deg"]["rmse"]))
+        text = " ".join(result["warnings"])
+        found = re.search(r"--transform-right (?:'([^']+)' in place of the one given|left out)", text)
+        if found is None:
+            break
+        advised = found[1] or "xyz: 0 0 0"
+    assert errors[-1][0] < 0.05 and errors[-1][1] < 1.0 and np.max(errors[0]) > 0.2
