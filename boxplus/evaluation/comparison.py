@@ -99,6 +99,8 @@ def compare(
 def short_names(paths: list[Path]) -> list[str]:
     """The shortest ends of paths that tell them apart, without the ending of the file where that is possible.
 
+    A path that is there again is numbered.
+
     Example:
         >>> short_names([Path("a/run.tum"), Path("b/run.tum"), Path("b/other.tum")])
         ['a/run', 'b/run', 'other']
@@ -110,10 +112,11 @@ def short_names(paths: list[Path]) -> list[str]:
     names = []
     for parts in whole:
         size = 1
-        while size < len(parts) and sum(other[-size:] == parts[-size:] for other in whole) > 1:
+        while size < len(parts) and any(other[-size:] == parts[-size:] for other in whole if other != parts):
             size += 1
         names.append("/".join(parts[-size:]))
-    return names
+    before = [names[:row].count(name) for row, name in enumerate(names)]
+    return [f"{name} ({count + 1})" if count else name for name, count in zip(names, before, strict=True)]
 
 
 def _doubts(evaluations: dict[str, Evaluation]) -> list[str]:

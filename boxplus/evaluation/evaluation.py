@@ -290,13 +290,18 @@ def _find_alignment(association: Association, kind: AlignmentKind, first: int | 
 
 
 def _order_doubts(estimate: Trajectory, ground_truth: Trajectory) -> list[str]:
-    """Whether the names of the files speak for the two being swapped: the field's tools have the other order."""
+    """Whether names or contents of the files speak for the two being swapped: the field's tools have the other order."""
     first, second = (Path(trajectory.source).name for trajectory in (estimate, ground_truth))
     truths = [_NAMED_TRUTH.search(name) is not None for name in (first, second)]
     runs = [name in _NAMES_OF_RUNS for name in (first, second)]
     if truths[0] > truths[1] or runs[1] > runs[0]:
         return [
             f"by their names, {first} is the ground truth and {second} the estimate: are they swapped? The ground truth is last"
+        ]
+    if ground_truth.covariance is not None and estimate.covariance is None and not truths[1]:
+        return [
+            f"{second} says how well each pose is known, as estimates do, and {first} does not: are they swapped? The ground "
+            "truth is last"
         ]
     return []
 

@@ -37,7 +37,10 @@ def read_fixes(path: str | Path, topic: str = ANY_GNSS) -> GnssFixes:
     container = open_container(path)
     try:
         found = [channel for channel in container.channels if channel.type == NAV_SAT_FIX and channel.count]
-        listed = ", ".join(f"{channel.topic} ({channel.count})" for channel in found) or "none"
+        if not found:
+            advice = "give the trajectory of another run or of the ground truth, or a recording with positions"
+            raise RecordingError(f"positions by satellite ({NAV_SAT_FIX})", f"none in {path.resolve().name}", advice)
+        listed = ", ".join(f"{channel.topic} ({channel.count})" for channel in found)
         chosen = [channel for channel in found if topic in (ANY_GNSS, channel.topic)]
         if not chosen:
             raise RecordingError(f"positions ({NAV_SAT_FIX})", f"those on {listed} in {path.name}", "name one with --gnss-topic")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from boxplus.evaluation.frames import transformed
 from boxplus.formats.trajectory import Trajectory, read_trajectory, write_csv, write_tum
 from boxplus.manifolds import quaternion, so3
 from boxplus.runs.transform import parse_transform
+from boxplus.simulation import SpinningLidar, simulate
+from boxplus.simulation.recording_writer import write_recording
 
 app = typer.Typer()
 app.command()(evaluate_command)
@@ -178,3 +181,27 @@ def test_a_pose_of_the_body_that_was_given_is_part_of_what_is_advised(
             break
         advised = found[1] or "xyz: 0 0 0"
     assert errors[-1][0] < 0.05 and errors[-1][1] < 1.0 and np.max(errors[0]) > 0.2
+
+
+def test_an_estimate_in_the_place_of_the_ground_truth_is_noticed_by_what_it_holds(files: tuple[str, str], tmp_path: Path) -> None:
+    estimate = read_trajectory(files[0])
+    known = replace(estimate, covariance=np.tile(1e-4 * np.eye(6), (len(estimate), 1, 1)))
+    write_csv(tmp_path / "first.csv", known)
+    write_tum(tmp_path / "second.tum", read_trajectory(files[1]))
+    first, second = str(tmp_path / "first.csv"), str(tmp_path / "second.tum")
+    told = "first.csv says how well each pose is known, as estimates do, and second.tum does not: are they swapped?"
+    assert told in CliRunner().invoke(app, [second, first]).output
+    for words in ([first, second], [first, first]):
+        assert "swapped" not in CliRunner().invoke(app, words).output
+
+
+def test_one_file_twice_is_two_estimates_with_short_names(files: tuple[str, str]) -> None:
+    found = json.loads(CliRunner().invoke(app, [files[0], files[0], files[1], "--json"]).stdout)
+    assert list(found["estimates"]) == ["estimate", "estimate (2)"]
+
+
+def test_a_recording_without_positions_by_satellite_says_so(files: tuple[str, str], tmp_path: Path) -> None:
+    simulated = simulate("walk", duration_s=0.3, lidar=SpinningLidar(azimuth_steps=50))
+    recording = write_recording(simulated, tmp_path / "walk", "ros1")
+    refused = str(CliRunner().invoke(app, [files[0], str(recording)]).exception)
+    assert "positions by satellite (sensor_msgs/NavSatFix) – got none in walk.bag – give the trajectory" in refused
