@@ -33,8 +33,9 @@ def several_recordings(given: Sequence[Path]) -> dict[str, Path] | None:
     if len(given) == 1:
         return find_recordings(given[0]) if holds_recordings(given[0]) else None
     if missing := [path for path in given if not path.exists()]:
+        listed = " and no ".join(map(str, missing))
         raise InputError(
-            "recordings that are there", f"no file or folder {missing[0]}", "check the path; results go to -o FOLDER"
+            "recordings that are there", f"no file or folder {listed}", "check the path, nothing was run; results go to -o FOLDER"
         )
     return named(given)
 

@@ -232,3 +232,14 @@ def test_ctrl_c_is_answered_in_quiet_runs_too(bags: Path, tmp_path: Path, monkey
     result = call("lio", bags / "in" / "a.bag", "-o", tmp_path / "out", *FAST, "--quiet")
     assert result.exit_code == 130 and result.stdout == ""
     assert result.stderr.startswith("interrupted: finishing the files; Ctrl-C again stops at once\n")
+
+
+def test_paths_that_are_not_there_are_told_before_any_is_run(bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A typo is better told at once than in the table an hour later; a file that is there and no recording is in the table."""
+    monkeypatch.chdir(tmp_path)
+    result = call("lio", "wrong.bag", bags / "in" / "a.bag", "worse.bag", "-o", tmp_path / "out", *FAST, "--json")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "got no file or folder wrong.bag and no worse.bag – check the path, nothing was run" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+    page = (Path(__file__).parents[3] / "docs" / "command_line.md").read_text(encoding="utf-8")
+    assert "One that is not there" in page and "refused before any is run (exit code 2)" in page
