@@ -10,11 +10,24 @@ import typer
 
 from boxplus.cli.options import PRINTING
 
+
+def checked_view(where: str | None) -> str | None:
+    """Where to show it: what cannot be is said before anything is read."""
+    if where is not None:
+        from boxplus._extras import require
+        from boxplus.report.viewer import check_target
+
+        check_target(where)
+        require("rerun", "which shows a run in 3D")
+    return where
+
+
 ViewOption = Annotated[
     str | None,
     typer.Option(
         "--view",
         metavar="WHERE",
+        callback=checked_view,
         help="Show it in 3D: window, FILE.rrd to open later with 'rerun FILE.rrd', or the address of a viewer on this machine, "
         "rerun+http://127.0.0.1:9876/proxy (needs: pip install rerun-sdk).",
         rich_help_panel=PRINTING,

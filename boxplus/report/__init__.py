@@ -65,8 +65,14 @@ def load_report(folder: str | Path) -> AnyRun:
     from boxplus.runs.slam.result import load_slam_result
     from boxplus.runs.storage.output_folder import SUMMARY, program_of
 
+    program = None
     with suppress(OSError):
         program = program_of(Path(folder) / SUMMARY)
+    if program not in (None, "boxplus lio", "boxplus slam", "boxplus vio", "boxplus vo"):
+        page = Path(folder) / "report.html"
+        advice = f"open {page}" if page.is_file() else "its command draws its report: run it again, without --no-report"
+        raise InputError("the output folder of 'boxplus lio', 'slam', 'vio' or 'vo'", f"one of {program!r} ({folder})", advice)
+    with suppress(OSError):
         if program == "boxplus vio":
             return load_visual_run(folder)
         if program == "boxplus vo":

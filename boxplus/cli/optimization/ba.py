@@ -144,11 +144,11 @@ def ba(
     with reported(file, folder, as_json=as_json) as outcome, ExitStack() as stack:
         with terminal.status("reading"):
             start = read_reconstruction(file, _POINT_FORMATS[format])
+        shown = stack.enter_context(viewing("ProblemView", file.name, view))
         files, folders = _own_files(folder)
         stack.enter_context(output_folder(folder, "boxplus ba", lambda: files, lambda: folders, overwrite=overwrite))
         name = reconstruction_file_name(start, file, "adjusted")
         terminal.facts(file.name, _describe(start), robust)
-        shown = stack.enter_context(viewing("ProblemView", file.name, view))
         if shown is not None:
             shown.show_scene(False, start.points, camera_centers(start))
         with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:

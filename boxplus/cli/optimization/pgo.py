@@ -161,6 +161,7 @@ def pgo(
                 graph = read_pose_graph(
                     file, rotation_error=rotation_error.value, cross_block=cross_block.value, ignore_unknown=ignore_unknown
                 )
+        shown = stack.enter_context(viewing("ProblemView", file.name, view))
         files, folders = _own_files(folder)
         stack.enter_context(output_folder(folder, "boxplus pgo", lambda: files, lambda: folders, overwrite=overwrite))
         name = "optimized.g2o" if kind == "g2o" else "optimized.graph"
@@ -170,7 +171,6 @@ def pgo(
         terminal.facts(file.name, described, robust)
         for warning in graph.warnings:
             terminal.warn(warning)
-        shown = stack.enter_context(viewing("ProblemView", file.name, view))
         if shown is not None and graph.poses is not None:
             shown.show_graph(False, positions(graph, graph.poses), graph.edges)
         with stop_on_interrupt(terminal.announce_stop) as should_stop, terminal.steps(method, should_stop) as show:

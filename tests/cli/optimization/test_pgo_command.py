@@ -11,9 +11,9 @@ import pytest
 from numpy.testing import assert_allclose
 from typer.testing import CliRunner, Result
 
-from boxplus._extras import installation
+from boxplus._extras import has, installation
 from boxplus.cli import app
-from boxplus.errors import SingularProblemError
+from boxplus.errors import InputError, SingularProblemError
 from boxplus.formats.graphs.g2o import read_g2o, write_g2o
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.formats.graphs.toro import read_toro, write_toro
@@ -171,7 +171,34 @@ def test_the_report_command_sends_back_to_the_page_that_is_there(tmp_path: Path)
     assert call(tmp_path / "loops.g2o", "-o", tmp_path / "out").exit_code == 0
     result = CliRunner().invoke(app, ["report", str(tmp_path / "out")])
     assert result.exit_code == 2
-    assert "one of 'boxplus pgo'" in words(result) and "open its report.html" in words(result)
+    expected = "the output folder of 'boxplus lio', 'slam', 'vio' or 'vo' – got one of 'boxplus pgo' ("
+    assert expected in words(result) and f"– open {tmp_path / 'out' / 'report.html'}" in words(result)
+    (tmp_path / "out" / "report.html").unlink()
+    without = CliRunner().invoke(app, ["report", str(tmp_path / "out")])
+    assert "its command draws its report: run it again, without --no-report" in words(without)
+
+
+@pytest.mark.parametrize("view", ["http://127.0.0.1:9876", "rerun+http://example.org:9876/proxy", "window.txt", "a.rrd"])
+def test_a_view_that_cannot_be_is_refused_before_anything_is_read(tmp_path: Path, view: str) -> None:
+    """As it is said of a file that is no graph; a.rrd wants rerun, which is not installed for tests."""
+    if view == "a.rrd" and has("rerun"):
+        pytest.skip("rerun is installed")
+    (tmp_path / "graph.g2o").write_text("no graph\n")
+    result = call(tmp_path / "graph.g2o", "-o", tmp_path / "out", "--view", view)
+    assert result.exit_code == 2 and ("--view" in words(result) or "rerun" in words(result) or "viewer" in words(result))
+    assert "pose graph" not in words(result) and not (tmp_path / "out").exists()
+
+
+def test_a_viewer_that_does_not_answer_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise InputError("a viewer that answers", "none", "open it")
+
+    write_g2o(tmp_path / "loops.g2o", loop_graph(2))
+    monkeypatch.setattr("boxplus._extras.require", lambda *_: None)
+    monkeypatch.setattr("boxplus.report.live_view.ProblemView", refuse)
+    result = call(tmp_path / "loops.g2o", "-o", tmp_path / "out", "--view", "rerun+http://127.0.0.1:9/proxy")
+    assert result.exit_code == 2 and "a viewer that answers" in words(result)
+    assert not (tmp_path / "out").exists()
 
 
 def test_false_loop_closures_are_refused_and_listed(tmp_path: Path) -> None:
