@@ -62,7 +62,7 @@ def inspect(
     T_given = None if T_imu_lidar is None else parse_transform(T_imu_lidar)
     console = make_console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(f"examining {recording.name}", total=1.0)
+        task = progress.add_task(f"examining {recording.resolve().name}", total=1.0)
         diagnosis = diagnose(
             recording,
             options,
@@ -98,7 +98,7 @@ def _print_table(diagnosis: Diagnosis) -> None:
     from boxplus.errors import printable
 
     console = make_console()
-    title = Text(printable(f"{diagnosis.path.name}: {diagnosis.format}"))
+    title = Text(printable(": ".join(filter(None, (diagnosis.path.resolve().name, diagnosis.format)))))
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
     table.add_column("what", no_wrap=True)

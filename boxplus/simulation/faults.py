@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._settings import suggestion
 from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
@@ -393,5 +394,5 @@ def make_fault(name: str) -> Fault:
         InputError: no fault of that name.
     """
     if name not in FAULTS:
-        raise InputError(f"a fault: {', '.join(FAULTS)}", repr(name), "see 'boxplus simulate --list'")
+        raise InputError("the name of a fault", repr(name), suggestion(name, FAULTS, "fault"))
     return FAULTS[name]()

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._settings import suggestion
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.simulation.imu import ImuModel
@@ -147,7 +148,7 @@ def make_scenario(name: str, seed: int = 0) -> Scenario:
         InputError: no scenario of that name.
     """
     if name not in SCENARIOS:
-        raise InputError(f"a scenario: {', '.join(SCENARIOS)}", repr(name), "see 'boxplus simulate --list'")
+        raise InputError("the name of a scenario", repr(name), suggestion(name, SCENARIOS, "scenario"))
     return SCENARIOS[name][1](seed)
 
 

@@ -180,3 +180,22 @@ def test_a_bar_leaves_no_trace_in_a_pipe(tmp_path: Path) -> None:
     assert (result.exit_code, result.stderr) == (1, "") and result.stdout.startswith("a.bag")
     result = CliRunner().invoke(app, ["simulate", "at_rest", "--duration", "0.3", "-o", str(tmp_path)])
     assert (result.exit_code, result.stderr) == (0, "") and result.stdout.startswith(str(tmp_path))
+
+
+def test_the_folder_one_stands_in_has_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "notes.txt").touch()
+    monkeypatch.chdir(tmp_path)
+    shown = CliRunner().invoke(app, ["inspect", "."], env={"COLUMNS": "200"}).stdout
+    assert shown.startswith(f"{tmp_path.name}\n") and f"got {tmp_path.name} with notes.txt" in " ".join(shown.split())
+    assert f"got {tmp_path.name} with notes.txt" in CliRunner().invoke(app, ["lio", "."]).stderr
+
+
+def test_that_there_is_no_imu_comes_before_what_else_is_missing(tmp_path: Path) -> None:
+    sequence = tmp_path / "00"
+    for name in ("image_0", "image_1"):
+        (sequence / name).mkdir(parents=True)
+        (sequence / name / "000000.png").touch()
+    (sequence / "calib.txt").write_text("P0: 700 0 600 0 0 700 180 0 0 0 1 0\n")
+    result = CliRunner().invoke(app, ["vio", str(sequence), "-o", str(tmp_path / "out")])
+    assert result.exit_code == 2 and "expected a recording with an IMU – got cameras alone in 00 – without" in result.stderr
+    assert not (tmp_path / "out").exists()

@@ -61,6 +61,13 @@ def test_options_stand_in_groups() -> None:
     assert text.index("Results:") < text.index("--gt PATH") < text.index("Settings:") < text.index("--threads N")
 
 
+def test_the_ground_truth_stands_with_the_results_in_every_command_that_takes_one() -> None:
+    for name in ("lio", "slam", "refine", "vio", "vo"):
+        text = CliRunner().invoke(app, [name, "--help"], env={"COLUMNS": "120"}).stdout
+        results = re.split(r"\n(?=\S)", text.split("\nResults:")[1])[0]
+        assert "\n  --gt " in results, name
+
+
 def test_usage_says_what_may_be_left_out_and_what_may_be_repeated() -> None:
     for path, usage in (("lio", "RECORDING…"), ("pgo", "FILE"), ("simulate", "[SCENARIO]"), ("map update", "MAP RUN…")):
         assert (
@@ -72,6 +79,8 @@ def test_usage_says_what_may_be_left_out_and_what_may_be_repeated() -> None:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
+        (["simulate", "wlak"], "got 'wlak' – did you mean walk? the scenarios are: walk, "),
+        (["simulate", "walk", "--fault", "drop_scan"], "got 'drop_scan' – did you mean drop_scans"),
         (["lioo"], "No such command 'lioo': did you mean 'lio'?"),
         (["reprot", "out"], "No such command 'reprot': did you mean 'report'?"),
         (["xyzzy"], "No such command 'xyzzy': 'boxplus --help' lists them all"),

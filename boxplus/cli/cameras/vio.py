@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -64,9 +65,11 @@ def vio(
     from boxplus.cli.cameras.camera_run import run_cameras
     from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.recordings.cameras.open import has_no_imu
     from boxplus.runs.cameras.folder import VioFolder
     from boxplus.runs.settings_file import load_settings
     from boxplus.runs.visual_inertial.config import VioRunConfig
+    from boxplus.runs.visual_inertial.rig_of_recording import cameras_alone
     from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
 
     overrides: dict[str, dict[str, object]] = {
@@ -76,10 +79,11 @@ def vio(
     run_config = load_settings(VioRunConfig, config, settings or (), overrides)
     folder = VioFolder(output or Path(f"{recording.resolve().stem}_boxplus"))
     terminal = RunTerminal(quiet=quiet, as_json=as_json)
-    with (
-        reported(recording, folder.path, as_json=as_json) as outcome,
-        viewing("LiveCameraView", recording.name, view) as shown,
-    ):
+    with ExitStack() as stack:
+        outcome = stack.enter_context(reported(recording, folder.path, as_json=as_json))
+        if has_no_imu(recording):
+            raise cameras_alone(recording)
+        shown = stack.enter_context(viewing("LiveCameraView", recording.name, view))
         run_cameras(
             recording,
             run_config.recording,

@@ -10,6 +10,7 @@ import typer
 
 from boxplus.cli.model_options import takes_options
 from boxplus.cli.options import (
+    RESULTS,
     SETTINGS,
     ConfigOption,
     JsonOption,
@@ -40,7 +41,12 @@ def vo(
     ] = None,
     mono: Annotated[bool, typer.Option("--mono", help="Use the first camera alone; the scale is not known then.")] = False,
     ground_truth: Annotated[
-        Path | None, typer.Option("--gt", help="Trajectory of the camera to compare with: TUM, KITTI, EuRoC or boxplus CSV.")
+        Path | None,
+        typer.Option(
+            "--gt",
+            help="Trajectory of the camera to compare with: TUM, KITTI, EuRoC or boxplus CSV.",
+            rich_help_panel=RESULTS,
+        ),
     ] = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

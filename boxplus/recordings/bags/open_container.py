@@ -56,7 +56,7 @@ def _parts(folder: Path) -> list[Path]:
     if not recordings:
         raise RecordingError(
             "a folder with .mcap or .db3 files (ROS 2), or with velodyne_points and oxts (KITTI raw)",
-            f"{folder.name} with {', '.join(sorted(file.name for file in folder.iterdir())[:5]) or 'nothing in it'}",
+            f"{folder.resolve().name} with {', '.join(sorted(file.name for file in folder.iterdir())[:5]) or 'nothing in it'}",
             "give the folder that holds them; of ROS 1 bags give one file; folders of images are for 'boxplus vo' and 'vio' "
             "(open_camera_recording)",
         )
@@ -64,7 +64,7 @@ def _parts(folder: Path) -> list[Path]:
         first, second = recordings[0][-1], recordings[1][0]
         raise RecordingError(
             "one recording: a folder with metadata.yaml, or with files NAME_0, NAME_1, … that follow each other without a gap",
-            f"{folder.name} with {len(recordings)} recordings: {second.name} does not go on where {first.name} ends",
+            f"{folder.resolve().name} with {len(recordings)} recordings: {second.name} does not go on where {first.name} ends",
             "give one of the files; where they are one recording with a pause, let 'ros2 bag reindex' write metadata.yaml; of "
             "files that are a recording each 'boxplus lio' and 'boxplus fleet run' take all",
         )

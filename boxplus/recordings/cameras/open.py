@@ -33,6 +33,15 @@ def has_cameras_only(path: Path) -> bool:
     return bool(kinds & set(IMAGE_PARSERS)) and not kinds & set(CLOUD_PARSERS)
 
 
+def has_no_imu(path: Path) -> bool:
+    """Whether this is a folder of a format that has no place for an IMU; told without reading it."""
+    return (
+        path.is_dir()
+        and not (is_euroc(path) or is_tum(path) or is_kitti_raw(path))
+        and (is_kitti_odometry(path) or is_seven_scenes(path))
+    )
+
+
 def open_camera_recording(path: str | Path, options: CameraRecordingOptions | None = None) -> CameraRecording:
     """Open a recording of cameras: a bag, a folder of EuRoC, TUM RGB-D, KITTI (raw or odometry) or 7-Scenes.
 
@@ -75,6 +84,6 @@ def open_camera_recording(path: str | Path, options: CameraRecordingOptions | No
         "a ROS bag or MCAP, a EuRoC folder (mav0/cam0), a folder with cam0/<time [ns]>.png, a TUM RGB-D folder (rgb.txt), a "
         "KITTI raw drive (image_00/data, image_00/timestamps.txt), a KITTI odometry sequence (image_0, calib.txt), or a "
         "7-Scenes sequence (frame-000000.color.png)",
-        f"{path.name}",
+        f"{path.resolve().name}",
         "convert the recording",
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from boxplus.errors import InputError, RecordingError
 from boxplus.recordings.cameras.info import CameraRecordingInfo
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
@@ -9,6 +11,13 @@ from boxplus.systems.visual_inertial_odometry.rig import Rig
 
 _NOISE = ("gyro_noise", "accel_noise", "gyro_bias_walk", "accel_bias_walk")
 _CALIBRATE = "give a Kalibr camchain with --calibration camchain.yaml"
+
+
+def cameras_alone(recording: Path) -> InputError:
+    """That a recording has no IMU."""
+    return InputError(
+        "a recording with an IMU", f"cameras alone in {recording.resolve().name}", "without an IMU use 'boxplus vo'"
+    )
 
 
 def rig_of_recording(info: CameraRecordingInfo, config: VioConfig) -> Rig:
@@ -22,7 +31,7 @@ def rig_of_recording(info: CameraRecordingInfo, config: VioConfig) -> Rig:
         InputError: no IMU, no camera; intrinsics, mounting or the IMU's noise are not known; depth images before intensities.
     """
     if info.imu is None:
-        raise InputError("a recording with an IMU", f"cameras alone in {info.path.name}", "without an IMU use 'boxplus vo'")
+        raise cameras_alone(info.path)
     cameras = [camera for camera in info.cameras if camera.kind == "intensity"]
     if not cameras or [camera.index for camera in cameras] != list(range(len(cameras))):
         found = ", ".join(f"{camera.name} ({camera.kind})" for camera in info.cameras)

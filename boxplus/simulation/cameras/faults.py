@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from boxplus._settings import suggestion
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.recordings.cameras.calibration import inverse
@@ -392,5 +393,5 @@ def make_camera_fault(name: str) -> CameraFault:
         InputError: no fault of that name.
     """
     if name not in CAMERA_FAULTS:
-        raise InputError(f"a fault: {', '.join(CAMERA_FAULTS)}", repr(name), "see 'boxplus simulate --list'")
+        raise InputError("the name of a fault", repr(name), suggestion(name, CAMERA_FAULTS, "fault"))
     return CAMERA_FAULTS[name]()

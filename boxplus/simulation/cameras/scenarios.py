@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from boxplus._settings import Settings
+from boxplus._settings import Settings, suggestion
 from boxplus.errors import InputError
 from boxplus.simulation import scenarios
 from boxplus.simulation.cameras.sensor import CameraRig, make_rig
@@ -135,6 +135,6 @@ def make_camera_scenario(name: str, seed: int = 0, rig: CameraRig | None = None)
         pixel_m = _PIXELS_OUTDOORS_M.get(name, 0.005)
         made = CameraScenario(name, filmed.world, filmed.trajectory, imu=filmed.imu, pixel_m=pixel_m)
     else:
-        known = ", ".join((*CAMERA_SCENARIOS, *scenarios.SCENARIOS))
-        raise InputError(f"a scenario: {known}", repr(name), "see 'boxplus simulate --list'")
+        known = (*CAMERA_SCENARIOS, *scenarios.SCENARIOS)
+        raise InputError("the name of a scenario", repr(name), suggestion(name, known, "scenario"))
     return made if rig is None else replace(made, rig=rig)
