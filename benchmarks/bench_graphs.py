@@ -34,11 +34,11 @@ from boxplus.systems.pose_graph.start import spanning_tree_start
 
 # Bar, and the optimum of χ² = Σ eᵀ Ω e with e = Log(Z⁻¹ T_i⁻¹ T_j); cubicle as `read_g2o` reads it by default.
 BARS = {
-    "sphere2500": (0.4, 1351.4019),
-    "parking-garage": (0.4, 1.268385),
-    "manhattan": (0.4, 3549.0411),
-    "torus3D": (0.4, 24235.274),
-    "cubicle": (0.4, 2712.9687),
+    "sphere2500": (0.2, 1351.4019),
+    "parking-garage": (0.2, 1.268385),
+    "manhattan": (0.2, 3549.0411),
+    "torus3D": (0.2, 24235.274),
+    "cubicle": (0.2, 2712.9687),
     "intel": (0.2, 45.004233),
     "CSAIL": (0.2, 40.550883),
     "MIT": (0.2, 41.206947),

@@ -52,12 +52,12 @@ def map_dynamic_metrics(results: Results) -> list[Metric]:
     name = "map_dynamic/"
     return [
         Metric(name + "query", query_ratio * scipy_us, "us", "lower", 0.3, "cKDTree, static", scipy_us),
-        Metric(name + "insertion of 2,000, median", stream["insert_ms_median"], "ms", bar=0.6, gated=False),
-        Metric(name + "insertion of 2,000, 99th percentile", stream["insert_ms_p99"], "ms", bar=2.0, gated=False),
-        Metric(name + "insertion of 2,000, worst", stream["insert_ms_worst"], "ms", bar=5.0, gated=False),
+        Metric(name + "insertion of 2,000, median", stream["insert_ms_median"], "ms", bar=0.5, gated=False),
+        Metric(name + "insertion of 2,000, 99th percentile", stream["insert_ms_p99"], "ms", bar=1.5, gated=False),
+        Metric(name + "insertion of 2,000, worst", stream["insert_ms_worst"], "ms", bar=3.0, gated=False),
         Metric(name + "same as brute force", stream["same_as_brute_force"], "yes", "higher", 1.0, tolerance=0.0),
         Metric(name + "memory per point, median", stream["bytes_per_point_median"], "bytes", bar=40.0, tolerance=0.05),
-        Metric(name + "memory per point, peak", stream["bytes_per_point_peak"], "bytes", tolerance=0.1),
+        Metric(name + "memory per point, peak", stream["bytes_per_point_peak"], "bytes", bar=40.0, tolerance=0.1),
         Metric(name + "build of 1M points", large["build_1m_s"], "s", bar=0.5, gated=False),
         Metric(name + "deletion of a 20 m cube from 1M", large["box_delete_ms"], "ms", bar=0.3, gated=False),
     ]
