@@ -90,9 +90,10 @@ def _read(read: Callable[[Path], _ReadT], source: Path, kind: str, to: str) -> _
     except InputError as error:
         other = _kind(source)
         if other not in ("", kind):
-            raise InputError(
-                f"{kind}, to be written as {to}", f"{source}, {other}", "name an output of the same kind, or give another source"
-            ) from error
+            advice = "name an output of the same kind, or give another source"
+            if other == "a recording":
+                advice = "a recording is not converted; 'boxplus lio', 'vio' and 'vo' make a trajectory of one"
+            raise InputError(f"{kind}, to be written as {to}", f"{source}, {other}", advice) from error
         if "ignore_unknown" in error.advice:
             advice = "check that it is a pose graph, and take other lines out: a graph is converted as a whole"
             raise InputError(error.expected, error.got, advice) from error

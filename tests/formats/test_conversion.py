@@ -247,7 +247,7 @@ def test_a_source_of_another_kind_is_named_without_options_of_other_commands(tmp
     for source, output, said in (
         ("path.tum", "a.g2o", r"a pose graph, to be written as g2o – got \S+path.tum, a trajectory – name an output of the same"),
         ("path.csv", "a.graph", r"a pose graph, to be written as toro – got \S+path.csv, a trajectory – "),
-        ("drive.bag", "a.csv", r"a trajectory, to be written as csv – got \S+drive.bag, a recording – "),
+        ("drive.bag", "a.csv", r"a trajectory, to be written as csv – got \S+drive.bag, a recording – a recording is not"),
         ("loops.g2o", "a.tum", r"a trajectory, to be written as tum – got \S+loops.g2o, a pose graph – "),
         ("bytes.txt", "a.tum", r"boxplus CSV \(comma-separated\) format – got binary data \(\S+\) – give a file in one of these"),
         ("more.g2o", "a.graph", r"got 'VERTEX_XY 5 1 2' .* – check that it is a pose graph, and take other lines out"),

@@ -82,7 +82,7 @@ def test_of_a_folder_the_failed_one_is_listed_and_the_other_unharmed(folder: Pat
     [
         (
             ["monday.bag", "nowhere"],
-            "expected recordings that are there – got no file or folder nowhere – check the path; results go",
+            "expected recordings that are there – got no file or folder nowhere – check the path, nothing was run; results go",
         ),
         (
             ["monday.bag", "monday.bag", "--gt", "monday.gt.tum"],
