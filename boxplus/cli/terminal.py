@@ -39,9 +39,9 @@ class Terminal:
         """Say that Ctrl-C was heard: who pressed it waits for an answer, in a quiet run as well."""
         self.alarms.print(f"interrupted: {self.stopping}; Ctrl-C again stops at once")
 
-    def say(self, text: str) -> None:
-        """A line."""
-        self.console.print(Text(printable(text)))
+    def say(self, text: str, *, copied: bool = False) -> None:
+        """A line; one that is there to be copied is not wrapped."""
+        self.console.print(Text(printable(text)), soft_wrap=copied)
 
     @contextmanager
     def working(self, text: str) -> Iterator[Callable[[float], None]]:

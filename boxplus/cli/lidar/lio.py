@@ -209,16 +209,34 @@ def run(
             rows.append(comparison.row)
     files = ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "evaluation.json", "run.json")
     terminal.print_results(summary, rows, folder, files)
+    if found := _found_mounting(summary):
+        terminal.say(found[0])
+        terminal.say(found[1], copied=True)
     return summary, comparison
+
+
+def _found_mounting(summary: RunSummary) -> tuple[str, str] | None:
+    """How well a run has found its mounting, and the option that gives it to another; None where it is not to be relied on."""
+    import numpy as np
+
+    from boxplus.runs.transform import transform_text
+
+    extrinsic = summary.extrinsic
+    trusted = summary.state == "finished" and summary.contradiction is None and extrinsic.estimation != "off"
+    deg, m = extrinsic.sigma_end_deg, extrinsic.sigma_end_m
+    if not trusted or extrinsic.source not in ("estimated", "identity") or deg is None or m is None:
+        return None
+    if deg > _KNOWN_DEG or m > _KNOWN_M:
+        return None
+    found = transform_text(np.array(extrinsic.T_imu_lidar_end))
+    known = f"mounting at the end, ± {deg:.2g} deg and {m * 100.0:.2g} cm, for other recordings of these sensors"
+    return f"{known}:", f"  --T-imu-lidar '{found}'"
 
 
 def _rows(summary: RunSummary, mounting_s: float) -> list[tuple[str, str]]:
     """What the terminal shows of a run of LiDAR and IMU, before which `mounting_s` seconds went into its mounting."""
-    import numpy as np
-
     from boxplus._words import counted
     from boxplus.cli.run_terminal import speed_text
-    from boxplus.runs.transform import transform_text
     from boxplus.sensors.sequencer import BEFORE_START
 
     timing, rows = summary.timing, []
@@ -230,12 +248,6 @@ def _rows(summary: RunSummary, mounting_s: float) -> list[tuple[str, str]]:
     if summary.extrinsic.source == "estimated":
         speed += f", after {mounting_s:.1f} s for the mounting"
     rows.append(("speed", speed))
-    extrinsic = summary.extrinsic
-    deg, m = extrinsic.sigma_end_deg, extrinsic.sigma_end_m
-    if extrinsic.source in ("estimated", "identity") and deg is not None and m is not None and deg < _KNOWN_DEG and m < _KNOWN_M:
-        found = transform_text(np.array(extrinsic.T_imu_lidar_end))
-        known = f"at the end, ± {deg:.2g} deg and {m * 100.0:.2g} cm, for other recordings of these sensors"
-        rows.append(("mounting", f"{known}: --T-imu-lidar '{found}'"))
     for lidar in summary.lidars[1:]:
         rows.append((f"LiDAR {lidar.topic}", f"{lidar.merged_points:,} points merged; against the first: {lidar.checked}"))
     rows.append(("map", f"{summary.map.stored_points:,} points" if summary.map.stored_points else "not kept"))

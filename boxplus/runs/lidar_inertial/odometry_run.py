@@ -327,11 +327,12 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         """Of the LiDARs among each other first: what else is contradicted may follow from it.
 
         Then what the first seconds of rotation contradict: the odometry compares shorter stretches, and with an estimate that may
-        have left the truth by then; what it found is among the warnings.
+        have left the truth by then, but also sees what comes later.
         """
         of_lidars = None if self._watch is None else self._watch.contradiction
-        rest = self._extrinsic.contradiction or self._odometry.contradiction or self._unknown_mounting
-        return of_lidars if rest is None else rest if of_lidars is None else f"{of_lidars}; {rest}"
+        found = [self._extrinsic.contradiction, self._odometry.contradiction]
+        told = [of_lidars, *(found if any(found) else [self._unknown_mounting])]
+        return "; ".join(dict.fromkeys(text for text in told if text)) or None
 
     @property
     def _unknown_mounting(self) -> str | None:

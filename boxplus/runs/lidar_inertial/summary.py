@@ -36,8 +36,8 @@ class ExtrinsicFacts(Part):
     estimation: str
     T_imu_lidar_start: Matrix
     T_imu_lidar_end: Matrix | None = None
-    sigma_end_deg: float | None = Field(None, description="of it, 1 sigma, about the axis where it is largest")
-    sigma_end_m: float | None = Field(None, description="likewise along an axis")
+    sigma_end_deg: float | None = Field(None, description="of it by the filter's covariance, 1 sigma, about the worst axis")
+    sigma_end_m: float | None = Field(None, description="likewise along the worst axis")
 
 
 class LidarFacts(Part):
