@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import bz2
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+from boxplus.recordings.bags.bounded_readers import open_reader
 from boxplus.recordings.bags.container import READ_ERRORS, Channel, foreign_errors
-from boxplus.recordings.bags.inflation import Zstd, inflate
 from boxplus.recordings.bags.messages import Encoding
 
 _FIRST_SKIP_NS = 250_000_000
@@ -32,7 +30,7 @@ class IndexedContainer:
         self._errors = READ_ERRORS + rosbags_errors()
         try:
             for file in files:
-                self._readers.append(_open_reader(file))
+                self._readers.append(open_reader(file))
             self.channels = self._collect_channels()
             self.start_ns = min(int(reader.start_time) for reader in self._readers)
             self.end_ns = max(int(reader.end_time) for reader in self._readers)
@@ -81,45 +79,6 @@ class IndexedContainer:
     def close(self) -> None:
         while self._readers:
             self._readers.pop().close()
-
-
-def _open_reader(file: Path) -> Any:
-    from rosbags.rosbag1 import Reader as Ros1Reader
-    from rosbags.rosbag2 import Reader as Ros2Reader
-
-    if file.suffix == ".bag":
-        reader = Ros1Reader(file)
-        reader.open()
-        _bound_ros1(reader)
-        return reader
-    _bound_ros2()
-    ros2_reader = Ros2Reader(file)
-    ros2_reader.open()
-    return ros2_reader
-
-
-def _bound_ros1(reader: Any) -> None:
-    """Let an open reader inflate its chunks up to our limit: rosbags itself has none."""
-    import lz4.frame
-
-    names = {bz2.decompress: "bz2", lz4.frame.decompress: "lz4"}
-    for position, chunk in reader.chunks.items():
-        if chunk.decompressor in names:
-            reader.chunks[position] = chunk._replace(decompressor=partial(inflate, names[chunk.decompressor]))
-
-
-def _bound_ros2() -> None:
-    """The same for all readers of ROS 2: they have one table in common. What is in it already fits any recorder's chunks."""
-    from rosbags.rosbag2 import reader, storage_mcap
-
-    for name in ("lz4", "zstd"):
-        storage_mcap.DECOMPRESSORS[name] = partial(_inflate_mcap, name)
-    for name in {"zstd", "zstandard"} & vars(reader).keys():
-        setattr(reader, name, Zstd())
-
-
-def _inflate_mcap(compression: str, data: bytes, size: int) -> bytes:
-    return inflate(compression, data)
 
 
 def _is_ros1(reader: object) -> bool:

@@ -6,9 +6,10 @@ import logging
 from pathlib import Path
 
 from boxplus.errors import RecordingError
+from boxplus.recordings.bags.bounded_readers import KNOWN_ROSBAGS, UnknownRosbagsError
 from boxplus.recordings.bags.container import READ_ERRORS, Container
 from boxplus.recordings.bags.indexed import IndexedContainer, rosbags_errors
-from boxplus.recordings.bags.parts import bag_files, is_described, recordings_among
+from boxplus.recordings.bags.parts import bag_files, is_compressed, is_described, recordings_among
 from boxplus.recordings.bags.sequential import begins_like_a_bag, open_sequential
 
 _LOG = logging.getLogger(__name__)
@@ -28,6 +29,12 @@ def open_container(path: Path) -> Container:
         return IndexedContainer(path, files)
     except READ_ERRORS + rosbags_errors() as error:
         reason = str(error) or type(error).__name__
+        if isinstance(error, UnknownRosbagsError) and is_described(path) and is_compressed(path):
+            raise RecordingError(
+                "a version of rosbags that can be limited, for a folder whose messages or files are compressed",
+                f"{path.name}: {reason}",
+                f"install rosbags {KNOWN_ROSBAGS}",
+            ) from error
     _LOG.info("%s has no usable index (%s): reading it from front to back", path, reason)
     if path.is_dir():
         files = bag_files(path)

@@ -34,6 +34,12 @@ def is_described(folder: Path) -> bool:
     return (folder / "metadata.yaml").is_file()
 
 
+def is_compressed(folder: Path) -> bool:
+    """Whether `metadata.yaml` says that messages, or files as a whole, are compressed."""
+    text = (folder / "metadata.yaml").read_text("utf-8", errors="replace")
+    return re.search(r"compression_mode: *['\"]?(message|file)\b", text, re.IGNORECASE) is not None
+
+
 def recordings_among(files: Iterable[Path]) -> list[list[Path]]:
     """Files by recording, the parts of each in order."""
     found: list[list[Path]] = []

@@ -84,6 +84,17 @@ def write_compressed(folder: Path, kind: str, compress: Compress) -> Path:
 KINDS = {"ros1 bz2": "bz2", "ros1 lz4": "lz4", "mcap": "zstd", "messages": "zstd", "file": "zstd"}
 
 
+def hiding_a_bomb(kind: str) -> Compress:
+    """Compresses, and lets the second chunk, or message, that holds clouds inflate to far more."""
+    compress, clouds = compressor(KINDS[kind]), []
+
+    def compress_and_hide(data: bytes) -> bytes:
+        clouds.extend([len(data)] if len(data) > 50_000 else [])
+        return compress(bytes(data) + bytes(BOMB) if len(clouds) == 2 else data)
+
+    return compress_and_hide
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_compressed_bags_come_back(kind: str, tmp_path: Path) -> None:
     with open_recording(write_compressed(tmp_path, kind, compressor(KINDS[kind]))) as recording:
@@ -96,14 +107,8 @@ def test_compressed_bags_come_back(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "file"])
 def test_a_chunk_that_would_fill_the_memory_is_damage(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second that holds clouds; the scans of the others are there."""
-    compress, clouds = compressor(KINDS[kind]), []
-
-    def compress_and_hide(data: bytes) -> bytes:
-        clouds.extend([len(data)] if len(data) > 50_000 else [])
-        return compress(bytes(data) + bytes(BOMB) if len(clouds) == 2 else data)
-
-    path = write_compressed(tmp_path, kind, compress_and_hide)
+    """The scans of the others are there."""
+    path = write_compressed(tmp_path, kind, hiding_a_bomb(kind))
     monkeypatch.setattr(inflation, "LARGEST_CHUNK", LIMIT)
     tracemalloc.start()
     try:
