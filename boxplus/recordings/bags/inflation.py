@@ -5,7 +5,9 @@ from __future__ import annotations
 import bz2
 import importlib
 import os
+import re
 import shutil
+from functools import partial
 from types import ModuleType, TracebackType
 from typing import Any, BinaryIO
 
@@ -15,6 +17,13 @@ LARGEST_CHUNK = 1 << 28
 """Bytes; no writer makes chunks anywhere near."""
 LARGEST_FILE_RATIO = 100
 """How many times its size a file that is compressed as a whole may inflate to, a chunk aside."""
+_FRAMES = {
+    "bz2": re.compile(rb"BZh[1-9]"),
+    "lz4": re.compile(rb"\x04\x22\x4d\x18"),
+    "zstd": re.compile(rb"\x28\xb5\x2f\xfd|[\x50-\x5f]\x2a\x4d\x18"),  # the latter: to be skipped
+}
+"""How a frame begins. Sources: bzip2 1.0.8, LZ4 frame format 1.6.4, RFC 8878."""
+_SLICE = 4096  # compressed bytes, which inflate to 130 MB at most
 
 
 def inflate(compression: str, data: bytes) -> bytes:
@@ -26,20 +35,19 @@ def inflate(compression: str, data: bytes) -> bytes:
     """
     if compression in ("none", ""):
         return data
+    new_frame: Any
     if compression == "bz2":
-        inflated = _inflated(bz2.BZ2Decompressor, data)
+        new_frame = bz2.BZ2Decompressor
     elif compression == "lz4":
         import lz4.frame
 
-        inflated = _inflated(lz4.frame.LZ4FrameDecompressor, data)
+        new_frame = lz4.frame.LZ4FrameDecompressor
     elif compression == "zstd":
         zstd = _zstd()
-        if hasattr(zstd, "ZstdFile"):
-            inflated = _inflated(zstd.ZstdDecompressor, data)
-        else:
-            inflated = bytes(_reader_of_zstandard(zstd, data).read(LARGEST_CHUNK + 1))
+        new_frame = zstd.ZstdDecompressor if hasattr(zstd, "ZstdFile") else partial(_ZstandardFrame, zstd)
     else:
         raise DamagedRecordError(f"unknown compression {compression!r}")
+    inflated = _inflated(new_frame, _FRAMES[compression], data)
     if len(inflated) > LARGEST_CHUNK:
         raise DamagedRecordError(f"{len(data)} compressed bytes inflate to more than {LARGEST_CHUNK} bytes")
     return inflated
@@ -89,17 +97,38 @@ class _InflatedFile:
         self._inflated.close()
 
 
-def _inflated(new_decompressor: Any, data: bytes) -> bytes:
-    """Frames that follow each other, up to one byte more than the limit."""
-    frames, left = [], LARGEST_CHUNK + 1
-    while data and left:
-        decompressor = new_decompressor()
-        frames.append(bytes(decompressor.decompress(data, max_length=left)))
+def _inflated(new_frame: Any, begins: re.Pattern[bytes], data: bytes) -> bytes:
+    """Frames that follow each other, up to one byte more than the limit. Behind the first, what begins none is ignored."""
+    frames: list[bytes] = []
+    left = LARGEST_CHUNK + 1
+    while data and left and (not frames or begins.match(data)):
+        frame = new_frame()
+        frames.append(bytes(frame.decompress(data, max_length=left)))
         left -= len(frames[-1])
-        if not decompressor.eof and left:
+        if not frame.eof and left:
             raise DamagedRecordError("the file is cut off in the middle of a chunk")
-        data = bytes(decompressor.unused_data or b"")
+        data = bytes(frame.unused_data or b"")
     return b"".join(frames)
+
+
+class _ZstandardFrame:
+    """What the decompressors of the other modules offer, by zstandard's, which has no limit but on what it is given."""
+
+    def __init__(self, zstandard: ModuleType) -> None:
+        self._frame = zstandard.ZstdDecompressor().decompressobj()
+        self.unused_data = b""
+
+    @property
+    def eof(self) -> bool:
+        return bool(self._frame.eof)
+
+    def decompress(self, data: bytes, max_length: int) -> bytes:
+        inflated, position = bytearray(), 0
+        while position < len(data) and len(inflated) < max_length and not self.eof:
+            inflated += self._frame.decompress(data[position : position + _SLICE])
+            position += _SLICE
+        self.unused_data = self._frame.unused_data + data[position:]
+        return bytes(inflated[:max_length])
 
 
 def _zstd() -> ModuleType:
@@ -112,5 +141,5 @@ def _zstd() -> ModuleType:
     return importlib.import_module("zstandard")
 
 
-def _reader_of_zstandard(zstandard: ModuleType, source: object) -> Any:
+def _reader_of_zstandard(zstandard: ModuleType, source: BinaryIO) -> Any:
     return zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True)

@@ -14,7 +14,7 @@ import tests.bags
 from boxplus.errors import RecordingError
 from boxplus.recordings import open_recording
 from boxplus.recordings.bags import inflation
-from boxplus.recordings.bags.container import DamagedRecordError
+from boxplus.recordings.bags.container import DamagedRecordError, foreign_errors
 from boxplus.sensors.scan import Scan
 from tests.bags import Content, write_bag
 
@@ -82,6 +82,25 @@ def write_compressed(folder: Path, kind: str, compress: Compress) -> Path:
 
 
 KINDS = {"ros1 bz2": "bz2", "ros1 lz4": "lz4", "mcap": "zstd", "messages": "zstd", "file": "zstd"}
+
+
+@pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])
+def test_what_follows_a_frame_and_is_none_is_ignored(compression: str) -> None:
+    compress, content = compressor(compression), np.random.default_rng(1).bytes(20_000)
+    chunk = compress(content)
+    for tail in (b"\0", bytes(4), bytes(5_000), b"padding", content):
+        assert inflation.inflate(compression, chunk + tail) == content
+        assert inflation.inflate(compression, chunk + chunk + tail) == 2 * content
+    for damaged in (b"padding" + chunk, chunk + chunk[:-9]):
+        with pytest.raises((ValueError, EOFError, OSError, RuntimeError, *foreign_errors())):
+            inflation.inflate(compression, damaged)
+
+
+@pytest.mark.parametrize("kind", ["ros1 bz2", "ros1 lz4"])
+def test_chunks_with_bytes_behind_them_are_read(kind: str, tmp_path: Path) -> None:
+    compress = compressor(KINDS[kind])
+    with open_recording(write_compressed(tmp_path, kind, lambda data: compress(data) + bytes(7))) as recording:
+        assert len([event for event in recording if isinstance(event, Scan)]) == SMALL.scans and not recording.rejected
 
 
 def hiding_a_bomb(kind: str) -> Compress:
