@@ -26,8 +26,8 @@ _FRAMES = {
 _SLICE = 4096  # compressed bytes, which inflate to 130 MB at most
 
 
-def inflate(compression: str, data: bytes) -> bytes:
-    """The content of a chunk or of a message.
+def inflate(compression: str, data: bytes, what: str = "chunk") -> bytes:
+    """The content of a chunk, or of what else errors are to name.
 
     Raises:
         DamagedRecordError: it is larger than `LARGEST_CHUNK`, cut off, or compressed in an unknown way; decompressors raise
@@ -48,8 +48,10 @@ def inflate(compression: str, data: bytes) -> bytes:
     else:
         raise DamagedRecordError(f"unknown compression {compression!r}")
     inflated = _inflated(new_frame, _FRAMES[compression], data)
+    if inflated is None:
+        raise DamagedRecordError(f"the file is cut off in the middle of a {what}")
     if len(inflated) > LARGEST_CHUNK:
-        raise DamagedRecordError(f"{len(data)} compressed bytes inflate to more than {LARGEST_CHUNK} bytes")
+        raise DamagedRecordError(f"a {what} of {len(data)} bytes inflates to more than {LARGEST_CHUNK} bytes")
     return inflated
 
 
@@ -62,7 +64,7 @@ class Zstd:
 
     def decompress(self, data: bytes) -> bytes:
         """One message."""
-        return inflate("zstd", data)
+        return inflate("zstd", data, "message")
 
     def open(self, file: BinaryIO, mode: str = "rb") -> _InflatedFile:
         """A file that is compressed as a whole."""
@@ -83,8 +85,8 @@ class _InflatedFile:
         self._limit = self._left = LARGEST_CHUNK + LARGEST_FILE_RATIO * self._size
 
     def read(self, size: int = -1, /) -> bytes:
-        """The next piece."""
-        piece = bytes(self._inflated.read(size))
+        """The next piece, or all."""
+        piece = bytes(self._inflated.read(size if 0 <= size <= self._left else self._left + 1))
         self._left -= len(piece)
         if self._left < 0:
             raise DamagedRecordError(f"a file of {self._size} bytes inflates to more than {self._limit} bytes")
@@ -97,8 +99,11 @@ class _InflatedFile:
         self._inflated.close()
 
 
-def _inflated(new_frame: Any, begins: re.Pattern[bytes], data: bytes) -> bytes:
-    """Frames that follow each other, up to one byte more than the limit. Behind the first, what begins none is ignored."""
+def _inflated(new_frame: Any, begins: re.Pattern[bytes], data: bytes) -> bytes | None:
+    """Frames that follow each other, up to one byte more than the limit; None where one is cut off.
+
+    Behind the first, what begins none is ignored.
+    """
     frames: list[bytes] = []
     left = LARGEST_CHUNK + 1
     while data and left and (not frames or begins.match(data)):
@@ -106,7 +111,7 @@ def _inflated(new_frame: Any, begins: re.Pattern[bytes], data: bytes) -> bytes:
         frames.append(bytes(frame.decompress(data, max_length=left)))
         left -= len(frames[-1])
         if not frame.eof and left:
-            raise DamagedRecordError("the file is cut off in the middle of a chunk")
+            return None
         data = bytes(frame.unused_data or b"")
     return b"".join(frames)
 

@@ -92,7 +92,7 @@ def test_functions_of_ros1_that_are_wrapped_are_limited_all_the_same(
     with open_recording(path) as recording:
         assert 3 <= len([event for event in recording if isinstance(event, Scan)]) < SMALL.scans
         texts = " ".join(finding.text for finding in recording.info.evidence if finding.key == "file")
-    assert ("inflate to more than 4194304 bytes" in texts) == (wrap == "table")
+    assert ("inflates to more than 4194304 bytes" in texts) == (wrap == "table")
     assert (f"the index cannot be used ({UNKNOWN}); the messages were collected from front to back" in texts) == (
         wrap == "chunks"
     )

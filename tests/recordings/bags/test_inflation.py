@@ -2,6 +2,7 @@
 
 import bz2
 import functools
+import re
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -45,7 +46,7 @@ def test_what_is_inflated_has_a_limit(compression: str, monkeypatch: pytest.Monk
     halves = compress(b"a" * (1 << 15)) + compress(b"b" * (1 << 15))
     assert inflation.inflate(compression, halves) == b"a" * (1 << 15) + b"b" * (1 << 15)
     for large in (compress(bytes((1 << 16) + 1)), chunk + compress(b"a")):
-        with pytest.raises(DamagedRecordError, match="inflate to more than 65536 bytes"):
+        with pytest.raises(DamagedRecordError, match=rf"^a chunk of {len(large)} bytes inflates to more than 65536 bytes$"):
             inflation.inflate(compression, large)
 
 
@@ -141,7 +142,10 @@ def test_a_chunk_that_would_fill_the_memory_is_damage(kind: str, tmp_path: Path,
     assert 3 <= len(lengths) < content.scans and set(lengths) == {content.points}
     assert recording.rejected["unreadable stretches of the file"] >= 1
     texts = [finding.text for finding in recording.info.evidence if finding.key == "file"]
-    assert any("compressed bytes inflate to more than 4194304 bytes); skipped" in text for text in texts)
+    told = re.compile(
+        rf"\(a {'message' if kind == 'messages' else 'chunk'} of \d+ bytes inflates to more than 4194304 bytes\); skipped"
+    )
+    assert any(map(told.search, texts))
 
 
 def test_a_file_that_would_fill_the_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,3 +155,25 @@ def test_a_file_that_would_fill_the_disk_is_refused(tmp_path: Path, monkeypatch:
     file.write_bytes(compressor("zstd")(bytes(BOMB)))
     with pytest.raises(RecordingError, match=r"– got recording: a file of \d+ bytes inflates to more than \d+"):
         open_recording(path)
+
+
+@pytest.mark.parametrize("size", [-1, 1 << 30])
+def test_a_file_is_not_inflated_past_its_limit_to_find_that_out(
+    size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inflation, "LARGEST_CHUNK", 1 << 10)
+    small, large = tmp_path / "small", tmp_path / "large"
+    small.write_bytes(compressor("zstd")(b"a" * 1000))
+    large.write_bytes(compressor("zstd")(bytes(BOMB)))
+    with small.open("rb") as file, inflation.Zstd().open(file) as inflated:
+        assert inflated.read(10) + inflated.read(size) + inflated.read(size) == b"a" * 1000
+    with large.open("rb") as file, inflation.Zstd().open(file) as inflated:
+        tracemalloc.start()
+        try:
+            for _ in range(2):  # nor afterwards
+                with pytest.raises(DamagedRecordError, match=r"^a file of "):
+                    inflated.read(size)
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    assert peak < BOMB / 8
