@@ -180,7 +180,7 @@ def optimize_pose_graph(
     whole, graph = graph, with_edges(graph, ~silent)
     held = held_poses(graph)
     problem, poses = pose_graph_problem(graph, held=held, loss=loss, objective=config.objective)
-    starts = Starts(graph, config.start, options, callback)
+    starts = Starts(graph, held, config.start, options, callback)
     built = time.perf_counter()
     known = starts.candidates(loss, is_robust=config.robust == "gnc")
     costs = {name: convex_cost(problem, [start]) for name, start in known.items()}

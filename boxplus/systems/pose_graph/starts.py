@@ -36,13 +36,15 @@ class Starts:
         bridges: loop closures that join pieces of odometry, believed for the company they keep.
     """
 
-    def __init__(self, graph: PoseGraph, wanted: Wanted, options: SolverOptions, callback: Callback | None) -> None:
+    def __init__(
+        self, graph: PoseGraph, held: NDArray[np.int64], wanted: Wanted, options: SolverOptions, callback: Callback | None
+    ) -> None:
         if wanted == "file" and graph.poses is None:
             raise InputError(
                 "poses in the file to start from", f"only edges ({graph.source})", "start with `chordal` or `spanning_tree`"
             )
         self.is_loop = ~consecutive_edges(graph)
-        self._graph, self._wanted, self._options, self._callback = graph, wanted, options, callback
+        self._graph, self._held, self._wanted, self._options, self._callback = graph, held, wanted, options, callback
         self.bridges: list[Bridge] = []
         self.verdict: LoopVerdict | None = None
         self._stopped = False
@@ -113,6 +115,7 @@ class Starts:
             minima[name] = 2.0 * tried.cost
             if tried.cost < best[1].cost:
                 best = (name, tried)
+        # Also where `enough` was reached: of 8 walks of 0.35 and 0.4 rad of noise that had got there, 3 fell by 3 to 10 % more.
         return self._relaxed(problem, *best, known, minima) if is_loud else best
 
     def _relaxed(
@@ -128,7 +131,7 @@ class Starts:
         In a local minimum stretches are wound the wrong way, and hold each other by many edges of which each is off by a little
         more than noise; once large errors count less, those that are right win.
         """
-        forgetting, _ = pose_graph_problem(self._graph, loss=Cauchy(_CAUCHY))
+        forgetting, _ = pose_graph_problem(self._graph, held=self._held, loss=Cauchy(_CAUCHY), objective="logarithm")
         watch = named(self._watch, "from another start, cauchy")
         for _ in range(_ROUNDS):
             if self._stopped:
@@ -147,7 +150,7 @@ class Starts:
             return self._graduated(self._dead_reckoning())
         if name == "chordal_objective":
             # Smooth where the logarithm jumps at half a turn, and with far fewer minima.
-            smooth, _ = pose_graph_problem(self._graph, objective="chordal")
+            smooth, _ = pose_graph_problem(self._graph, held=self._held, loss=None, objective="chordal")
             watch = named(self._watch, "finding another start by the chordal objective")
             return smooth.solve(self._options, start=[chordal_start(self._graph)], callback=watch).values[0]
         return chordal_start(self._graph) if name == "chordal" else spanning_tree_start(self._graph)

@@ -81,6 +81,14 @@ def test_a_loss_that_forgets_leaves_a_minimum_in_which_both_starts_agree():
     assert "ends lowest" in result.start_reason
 
 
+def test_a_start_that_is_low_enough_is_left_as_well_where_rotations_are_noisy():
+    settings = {"dimension": 3, "poses": 300, "sigma_rotation": 0.35, "sigma_translation": 0.1}
+    result = optimize_pose_graph(simulate_pose_graph(seed=8, **settings).graph)
+    first, further = result.minima["chordal"], result.minima["chordal_objective"]
+    assert first > result.fit.enough > further and "file" not in result.minima  # the second start ended the search
+    assert result.start == "cauchy" and result.chi2 < 0.99 * further
+
+
 def test_noise_that_leaves_room_for_local_minima_tries_the_smooth_objective_and_says_so():
     told = 0
     for seed in (1, 3, 5):
