@@ -55,7 +55,7 @@ $(VENV)/.runtime: pyproject.toml $(VENV)/.python
 $(VENV)/.dev: pyproject.toml $(VENV)/.python
 	@echo "installing boxplus and the tools for its tests into $(VENV) (once; about a minute)"
 	@$(PIP) install -e '.[dev,vision,fleet,sensors]'
-	@$(PIP) install --no-deps 'ouster-sdk>=1.0'
+	@$(PIP) install --no-deps 'ouster-sdk>=1.0' || echo "no ouster-sdk for this platform: captures of Ouster are not tested"
 	@touch $(VENV)/.runtime $@
 
 $(VENV)/.docs: pyproject.toml $(VENV)/.python

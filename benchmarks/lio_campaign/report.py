@@ -45,7 +45,7 @@ def against(lines: Sequence[Line], before: Sequence[Line]) -> str:
 
 
 def _recording(line: Line) -> tuple[Any, ...]:
-    return tuple(line[key] for key in ("seed", "real", "rough", "fast"))
+    return tuple(line[key] for key in ("seed", "real", "rough", "fast", "bag"))
 
 
 def _summary(lines: Sequence[Line]) -> str:

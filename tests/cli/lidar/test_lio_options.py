@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -121,6 +122,7 @@ def test_fleet_refuses_a_folder_without_recordings(tmp_path: Path) -> None:
     assert result.exit_code == 2 and f"expected a folder with recordings – got none in {tmp_path}" in result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray, the extra fleet")
 def test_a_fleet_names_the_recording_that_failed(folder: Path, tmp_path: Path) -> None:
     result = call("fleet", "run", folder, "-o", tmp_path / "fleet", "--workers", "1", "--set", "slam.appearance=scan_context")
@@ -128,7 +130,7 @@ def test_a_fleet_names_the_recording_that_failed(folder: Path, tmp_path: Path) -
     assert " tuesday: failed" in result.stdout and " monday: finished" in result.stdout, result.stdout
 
 
-@pytest.mark.skipif(importlib.util.find_spec("ray") is not None, reason="Ray is installed")
-def test_a_fleet_without_ray_names_the_extra(folder: Path, tmp_path: Path) -> None:
+def test_a_fleet_without_ray_names_the_extra(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
     result = call("fleet", "run", folder, "-o", tmp_path / "fleet")
     assert result.exit_code == 2 and installation("fleet") in result.stderr

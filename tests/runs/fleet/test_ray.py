@@ -20,6 +20,7 @@ from boxplus.runs.slam.config import SlamRunConfig
 from tests.runs.fleet.test_fleet_run import QUICK, drive
 
 ray = pytest.importorskip("ray", reason="needs Ray, the extra fleet")
+pytestmark = pytest.mark.slow
 
 
 def work(folder: str, number: int) -> int:
