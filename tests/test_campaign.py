@@ -314,7 +314,7 @@ def test_a_report_says_which_bars_were_met_and_what_ended_otherwise(campaign: Si
         line["verdict"] = "flagged"
     text = campaign.report.report([*sound, *faulty])
     assert "silently wrong or crashed: 1 of 20, NOT MET" in text
-    assert "of the faulty runs that are not right: 80.0%, NOT MET" in text
+    assert "of the faulty runs that are not right: 80.0%, NOT MET (named or right: 80.0% of all faulty ones)" in text
     assert "of the sound runs a false alarm: 10.0%, NOT MET" in text
     now = [line | {"worst_m": 0.041} for line in sound[2:]] + [line | {"verdict": "silent"} for line in faulty[:1]]
     compared = campaign.report.against([*now, now[0] | {"seed": 99}], [*sound, *faulty])

@@ -130,7 +130,8 @@ class Errors:
         position_m, rotation_deg, position_sigmas, rotation_sigmas, limit_m: (N,) each.
         jumped: (N,) shortly after the ground truth itself jumped.
         way_m: true length of the way.
-        nees: normalised estimation error squared of the pose, mean over scans after the first, per degree of freedom.
+        nees: normalised estimation error squared of the pose, mean over scans after the first that have not `jumped`, per degree
+            of freedom.
     """
 
     e_p: NDArray[np.float64]
@@ -190,6 +191,8 @@ def errors_of(estimate: Trajectory, truth: Truth, jumps_ns: NDArray[np.int64] = 
     way = np.interp(time_ns, every, np.concatenate([[0.0], np.cumsum(steps)]))
     P = estimate.covariance
     squared = _mahalanobis(np.concatenate([e_R, e_p], axis=1), P)
+    jumped = np.any((time_ns[:, None] >= jumps_ns) & (time_ns[:, None] < jumps_ns + _JUMP_LASTS_NS), axis=1)
+    counted = squared[1:][~jumped[1:]]
     return Errors(
         e_p=e_p,
         R_error=R @ np.swapaxes(R_true, 1, 2),
@@ -198,9 +201,9 @@ def errors_of(estimate: Trajectory, truth: Truth, jumps_ns: NDArray[np.int64] = 
         position_sigmas=np.sqrt(_mahalanobis(e_p, P[:, 3:, 3:])),
         rotation_sigmas=np.sqrt(_mahalanobis(e_R, P[:, :3, :3])),
         limit_m=np.maximum(FLOOR_M, SHARE_OF_WAY * way),
-        jumped=np.any((time_ns[:, None] >= jumps_ns) & (time_ns[:, None] < jumps_ns + _JUMP_LASTS_NS), axis=1),
+        jumped=jumped,
         way_m=float(way[-1]),
-        nees=float(squared[1:].mean() / 6.0) if len(squared) > 1 else 0.0,
+        nees=float(counted.mean() / 6.0) if len(counted) else 0.0,
     )
 
 

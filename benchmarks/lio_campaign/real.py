@@ -32,7 +32,7 @@ _FLIGHTS = {"V1_03_difficult": 104.0, "MH_05_difficult": 110.0}
 """Sequences with the seconds of them that may be used."""
 _SENSORS = {"velodyne": (-15.0, 15.0), "ouster": (-22.5, 22.5), "livox": (0.0, 0.0)}
 """Sensors with the elevations of their lowest and highest ring [deg]; a Livox has none."""
-_JUMP_M = 0.005
+_JUMP_M, _CLOSE_S = 0.005, 0.02
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,7 @@ class RecordedTruth:
         self.start_ns, self.end_ns = int(poses.time_ns[0]), int(poses.time_ns[-1])
         time_s = (poses.time_ns - self.start_ns) * 1e-9
         self._p = CubicSpline(time_s, poses.p)
+        assert float(np.median(np.diff(time_s))) < _CLOSE_S, "poses farther apart differ from one another by their motion"
         v = np.diff(poses.p, axis=0) / np.diff(time_s)[:, None]
         odd = np.linalg.norm(v[1:-1] - 0.5 * (v[:-2] + v[2:]), axis=1) * np.diff(time_s)[1:-1] > _JUMP_M
         self.jumps_ns = poses.time_ns[1:-2][odd]

@@ -253,6 +253,7 @@ def _figures(errors: Errors | None) -> dict[str, Any]:
         "last_m": round(float(errors.position_m[-1]), 4),
         "worst_sigmas": round(float(max(errors.position_sigmas.max(), errors.rotation_sigmas.max())), 2),
         "nees": round(errors.nees, 3),
+        "jumped": round(float(errors.jumped.mean()), 3),
     }
 
 
