@@ -11,9 +11,8 @@ from pathlib import Path
 
 from boxplus.errors import InputError
 from boxplus.formats.output import TEMPORARY_SUFFIX
-from boxplus.runs.storage.earlier_results import EarlierResults
 from boxplus.runs.storage.folder_lock import locked_folder
-from boxplus.runs.storage.output_folder import SUMMARY, doubts_of, output_folder, program_of, refuse_both, settled
+from boxplus.runs.storage.output_folder import SUMMARY, doubts_of, output_folder, program_of, refuse_both
 
 PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
 _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")
@@ -172,9 +171,8 @@ def doubts_of_map(tiles: Path) -> list[str]:
 def claim_run_folder(folder: str | Path, *, overwrite: bool = False, resume: bool = False) -> Iterator[RunFolder]:
     """A folder to write a run into, locked while the block runs: new, empty, or cleared of an earlier run's own files.
 
-    An earlier run without a single estimate is replaced, any other one with `overwrite`: its results stay in the folder, apart,
-    until the new ones are finished, and are put back where there are none. What a run did not write is never removed. To
-    `resume` a run, all of it stays.
+    An earlier run without a single estimate is replaced, any other one with `overwrite`. What a run did not write is never
+    removed. To `resume` a run, all of it stays.
 
     Raises:
         InputError: another process is writing there; the folder holds something else, or an earlier run and `overwrite` is
@@ -184,17 +182,10 @@ def claim_run_folder(folder: str | Path, *, overwrite: bool = False, resume: boo
     refuse_both(overwrite, resume)
     run = RunFolder(Path(folder))
     if resume:
-        earlier = EarlierResults(run.path, run.own_files, run.own_folders, run.holds_estimates)
-        with run.locked_to_resume("boxplus lio"), settled(earlier, "boxplus lio"):
+        with run.locked_to_resume("boxplus lio"):
             yield run
         return
     with output_folder(
-        run.path,
-        "boxplus lio",
-        run.own_files,
-        run.own_folders,
-        overwrite=overwrite,
-        holds_results=run.holds_estimates,
-        keeps_earlier=True,
+        run.path, "boxplus lio", run.own_files, run.own_folders, overwrite=overwrite, holds_results=run.holds_estimates
     ):
         yield run

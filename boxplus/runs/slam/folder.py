@@ -13,9 +13,8 @@ from boxplus.formats.output import EARLIER_SUFFIX, TEMPORARY_SUFFIX
 from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.runs.run_folder import RunFolder, is_map_file
 from boxplus.runs.slam.summary import read_slam_summary
-from boxplus.runs.storage.earlier_results import EarlierResults
 from boxplus.runs.storage.folder_lock import locked_folder
-from boxplus.runs.storage.output_folder import output_folder, refuse_both, settled
+from boxplus.runs.storage.output_folder import output_folder, refuse_both
 
 PROGRAM = "boxplus slam"
 _LOCAL_MAP_FILE = re.compile(r"(\d{6,}|graph)\.npz")
@@ -128,17 +127,10 @@ def claim_slam_folder(folder: str | Path, *, overwrite: bool = False, resume: bo
     refuse_both(overwrite, resume)
     slam = SlamFolder(Path(folder))
     if resume:
-        earlier = EarlierResults(slam.path, slam.own_files, slam.own_folders, slam.odometry.holds_estimates)
-        with slam.locked_to_resume(PROGRAM), settled(earlier, PROGRAM):
+        with slam.locked_to_resume(PROGRAM):
             yield slam
         return
     with output_folder(
-        slam.path,
-        PROGRAM,
-        slam.own_files,
-        slam.own_folders,
-        overwrite=overwrite,
-        holds_results=slam.odometry.holds_estimates,
-        keeps_earlier=True,
+        slam.path, PROGRAM, slam.own_files, slam.own_folders, overwrite=overwrite, holds_results=slam.odometry.holds_estimates
     ):
         yield slam

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -11,11 +10,9 @@ from typing import Any
 
 from boxplus.errors import InputError
 from boxplus.formats.output import TEMPORARY_SUFFIX, make_folder, output_error
-from boxplus.runs.storage.earlier_results import EarlierResults
 from boxplus.runs.storage.folder_lock import LOCK, locked_folder
 
 SUMMARY = "run.json"
-_log = logging.getLogger(__name__)
 
 
 def refuse_both(overwrite: bool, resume: bool) -> None:
@@ -39,7 +36,6 @@ def output_folder(
     *,
     overwrite: bool = False,
     holds_results: Callable[[], bool] = lambda: True,
-    keeps_earlier: bool = False,
 ) -> Iterator[Path]:
     """A folder to write results into, locked while the block runs: new, empty, or cleared of an earlier run's own files.
 
@@ -50,8 +46,6 @@ def output_folder(
         program: who writes here, as `run.json` says; the results of another program are not replaced.
         files, folders: what a run writes, `run.json` included; folders are removed where they are empty, in this order.
         holds_results: whether there are results beside a `run.json`.
-        keeps_earlier: whether results that are replaced stay in the folder, apart, until those of a new run are finished, which
-            `run.json` says then; where it leaves none they are put back.
 
     Raises:
         InputError: another process is writing there; the folder holds something else, or an earlier run's results and
@@ -61,21 +55,22 @@ def output_folder(
     is_new = not Path(folder).exists()
     path = make_folder(folder)
     with _gone_where_empty(path, is_new), locked_folder(path, program) as lock:
-        earlier = EarlierResults(path, files, folders, holds_results)
         try:
-            _settle(earlier, program)
             if _has_to_be_cleared(path, program, files, overwrite, lock.began_before, holds_results):
-                if keeps_earlier and holds_results():
-                    earlier.set_aside()
-                else:
-                    earlier.clear()
+                # The summary goes last: interrupted here, the folder is still known as a run's.
+                for file in sorted(files(), key=lambda file: file == path / SUMMARY):
+                    for name in (file.name, file.name + TEMPORARY_SUFFIX):
+                        file.with_name(name).unlink(missing_ok=True)
+                for inner in folders():
+                    with suppress(OSError):  # a folder with files of others stays
+                        inner.rmdir()
         except OSError as error:
             raise output_error(path, error) from error
         try:
-            with settled(earlier, program):
-                yield path
+            yield path
         finally:
-            lock.keep_file = not (path / SUMMARY).exists() and any(entry.name != LOCK for entry in path.iterdir())
+            left = [entry for entry in path.iterdir() if entry.name != LOCK] if path.is_dir() else []
+            lock.keep_file = bool(left) and not (path / SUMMARY).exists()
 
 
 @contextmanager
@@ -87,28 +82,6 @@ def _gone_where_empty(path: Path, is_new: bool) -> Iterator[None]:
         if is_new:
             with suppress(OSError):  # there is something in it
                 path.rmdir()
-
-
-@contextmanager
-def settled(earlier: EarlierResults, program: str) -> Iterator[None]:
-    """What becomes of results that are kept in a folder, at the end of the block, by how the run that has it now ended."""
-    earlier.put_together()
-    try:
-        yield
-    finally:
-        try:
-            _settle(earlier, program)
-            if earlier.kept.is_dir():
-                _log.warning("the earlier results are kept in %s until a run there comes to its end", earlier.kept)
-        except OSError as error:
-            _log.warning("the earlier results in %s could not be put back or removed: %s", earlier.kept, error)
-
-
-def _settle(earlier: EarlierResults, program: str) -> None:
-    kept, now = earlier.kept / SUMMARY, earlier.path / SUMMARY
-    earlier.put_together()
-    if earlier.kept.is_dir() and not (kept.is_file() and program_of(kept) not in (program, None)):
-        earlier.settle(is_finished=now.is_file() and state_of(now) == "finished")
 
 
 def _has_to_be_cleared(
