@@ -45,7 +45,7 @@ def in_options(text: str, options: Mapping[str, str]) -> str:
         'raise --max-diff'
     """
     for pattern, option in options.items():
-        text = re.sub(pattern, option, text)
+        text = re.sub(rf"(?<![/\\.]){pattern}(?!\.\w)", option, text)  # no names of files
     return text
 
 

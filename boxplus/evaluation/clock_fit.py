@@ -60,8 +60,8 @@ class ClockFit:
     def together(cls, fits: list[ClockFit]) -> ClockFit | None:
         """What both signals tell, weighted; where they contradict each other one is off by an error that no stretch shows.
 
-        Nothing tells which: half of the square by which their difference exceeds what they know, as DerSimonian and Laird (1986)
-        have it, is added to the variance. Offsets far apart are two, of motion that repeats itself: the better known counts.
+        Nothing tells which: half of the square by which their difference exceeds what they know is added to the variance. Offsets
+        far apart are two, of motion that repeats itself: the better known counts.
         """
         best = sorted(fits, key=lambda fit: fit.deviation_s)
         if len(best) < 2 or abs(best[0].offset_s - best[1].offset_s) > _OTHER_S:

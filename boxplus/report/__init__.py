@@ -68,10 +68,8 @@ def load_report(folder: str | Path) -> AnyRun:
     program = None
     with suppress(OSError):
         program = program_of(Path(folder) / SUMMARY)
-    if program not in (None, "boxplus lio", "boxplus slam", "boxplus vio", "boxplus vo"):
-        page = Path(folder) / "report.html"
-        advice = f"open {page}" if page.is_file() else "its command draws its report: run it again, without --no-report"
-        raise InputError("the output folder of 'boxplus lio', 'slam', 'vio' or 'vo'", f"one of {program!r} ({folder})", advice)
+    if program is not None and program not in ("boxplus lio", "boxplus slam", "boxplus vio", "boxplus vo"):
+        raise _of_another(Path(folder), program)
     with suppress(OSError):
         if program == "boxplus vio":
             return load_visual_run(folder)
@@ -79,16 +77,17 @@ def load_report(folder: str | Path) -> AnyRun:
             return load_direct_run(folder)
         if program == "boxplus slam":
             return load_slam_result(folder)
-        if program not in (None, "boxplus lio"):
-            raise _of_another(Path(folder), program)
     return load_run(folder)
 
 
 def _of_another(folder: Path, program: str) -> InputError:
     """What to do about the folder of a command whose report is drawn once."""
+    page, odometry = folder / "report.html", folder / "odometry"
     advice = "it has no report; run.json has the facts"
-    if (folder / "report.html").is_file():
-        advice = "open its report.html, which that command has drawn"
-    elif (folder / "odometry" / "run.json").is_file():
-        advice = f"draw that of its odometry: 'boxplus report {folder / 'odometry'}'"
+    if page.is_file():
+        advice = f"open {page}, which that command has drawn"
+    elif (odometry / "run.json").is_file():
+        advice = f"draw that of its odometry: 'boxplus report {odometry}'"
+    elif program in ("boxplus ba", "boxplus pgo"):
+        advice = "its command draws its report: run it again, without --no-report"
     return InputError("the output folder of 'boxplus lio', 'slam', 'vio' or 'vo'", f"one of {program!r} ({folder})", advice)

@@ -15,7 +15,7 @@ from boxplus.sensors.imu import ImuSamples
 _STUCK_S, _FEWEST = 0.5, 10  # over which, and how many samples, all three axes repeat themselves
 _BEFORE = 4  # samples before, of a turn that lasted
 _MOST_RAD_S2 = 100.0  # by which a turn may stop: 1 rad/s within a hundredth of a second
-_PARTS, _TO_AND_FRO_RAD_S = 5, 0.1  # parts of the time, whose mean rates differ by more
+_PARTS, _TO_AND_FRO_RAD_S = 5, 0.1  # parts of the time, with mean rates beyond this either way
 _GYRO, _ACCEL = slice(0, 3), slice(3, 6)
 _GYRO_NOISE, _ACCEL_NOISE = 2e-4, 2e-3  # rad/s, m/s²: second differences that no smooth motion has; real IMUs ten times
 
@@ -38,8 +38,8 @@ class StuckSensor:
         first = min(int(np.searchsorted(time_ns, time_ns[-1] - enough_ns)), len(time_ns) - _FEWEST - int(new.sum())) - _BEFORE
         self._time_ns, self._values = time_ns[max(first, 0) :], values[max(first, 0) :]
         if self._stopped():
-            return self._sentence("gyroscope")
-        return self._sentence("accelerometer") if self._feels_nothing() else None
+            return self._sentence("gyroscope", "and went there from a turn within one of them")
+        return self._sentence("accelerometer", "although the platform turns to and fro") if self._feels_nothing() else None
 
     def _stopped(self) -> bool:
         """Whether the gyroscope repeats itself since it stopped within a sample."""
@@ -47,8 +47,12 @@ class StuckSensor:
         if begin is None or begin < _BEFORE:
             return False
         steps = np.linalg.norm(self._values[begin - _BEFORE : begin, _GYRO] - self._values[begin, _GYRO], axis=1)
-        seconds = float(self._time_ns[begin] - self._time_ns[begin - 1]) * 1e-9
+        # Samples that come in bursts may bear stamps that lie much closer than they were taken.
+        seconds = max(float(self._time_ns[begin] - self._time_ns[begin - 1]) * 1e-9, self._seconds_a_sample())
         return bool(steps.min() > _MOST_RAD_S2 * seconds)
+
+    def _seconds_a_sample(self) -> float:
+        return float(self._time_ns[-1] - self._time_ns[0]) * 1e-9 / (len(self._time_ns) - 1)
 
     def _feels_nothing(self) -> bool:
         """Whether the accelerometer repeats itself while the gyroscope turns to and fro."""
@@ -56,7 +60,7 @@ class StuckSensor:
         if begin is None:
             return False
         means = np.array([part.mean(axis=0) for part in np.array_split(self._values[begin:, _GYRO], _PARTS)])
-        return bool(means.std(axis=0).max() > _TO_AND_FRO_RAD_S)
+        return bool(np.minimum(means.max(axis=0), -means.min(axis=0)).max() > _TO_AND_FRO_RAD_S)
 
     def _stuck_since(self, axes: slice, other: slice, noise: float) -> int | None:
         """The sample since which a sensor repeats itself, if that is long enough and the other sensor has noise."""
@@ -67,8 +71,8 @@ class StuckSensor:
             return None
         return begin if np.abs(np.diff(self._values[begin:, other], 2, axis=0)).mean() > noise else None
 
-    def _sentence(self, name: str) -> str:
+    def _sentence(self, name: str, how: str) -> str:
         return (
-            f"for half a second and more the {name} has given the same values sample after sample although the platform moves: "
-            "it has failed, or its driver repeats what it had last"
+            f"for half a second and more the {name} has given the same values sample after sample, {how}: it has failed, or its "
+            "driver repeats what it had last"
         )
