@@ -176,11 +176,28 @@ def test_a_shaken_drive_whose_way_is_open_is_no_start_at_no_speed() -> None:
 
 
 @pytest.mark.slow
-def test_a_path_that_creeps_along_a_smooth_tunnel_is_no_start_in_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("seen", [8, 17])
+@pytest.mark.parametrize("seed", [1, 3, 4])
+def test_a_slow_hand_in_an_open_field_starts_though_nothing_faces_it(seed: int, seen: int) -> None:
+    """As soon as it did without asking what does."""
+    motion = manoeuvres.handheld(4.5, (-3.0, -1.0, 1.0), (3.0, 1.0, 2.0), 0.4, 1.5, standstill_s=0.0, seed=seed)
+    lidar = SpinningLidar(channels=16, azimuth_steps=250)
+    simulation = Simulation(Scenario("field", sites.open_field(seed=seed), motion, lidar), seed, 3.2)
+    found = find_start(frames(simulation.events())[:seen], config(simulation))
+    refused_for_it = isinstance(found, str) and "whether the platform moves along (" in found
+    assert not refused_for_it and (isinstance(found, Start) or seen == 8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("range_sigma_m", [0.01, 0.03])
+def test_a_path_that_creeps_along_a_smooth_tunnel_is_no_start_in_motion(
+    range_sigma_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As it does where others overtake: nothing faces the way, so that it stays where it is at any speed."""
+    lidar = SpinningLidar(channels=32, azimuth_steps=512, range_sigma_m=range_sigma_m)
     drive = manoeuvres.constant_velocity(3.0, (0.0, 0.2, 1.8), (20.0, 0.0, 0.0), np.eye(3))
     imu = ImuModel(accel_vibration=0.9, gyro_vibration=0.02, vibration_hz=60.0)
-    simulation = Simulation(Scenario("tunnel", sites.tunnel(600.0), drive, LIDAR, imu, np.eye(4)), 5, 1.2)
+    simulation = Simulation(Scenario("tunnel", sites.tunnel(600.0), drive, lidar, imu, np.eye(4)), 5, 1.2)
     creeping = Rest(False, np.zeros((0, 3)), np.zeros((0, 3)), 0.033, 0.0)
     monkeypatch.setattr(start_module, "judge_rest", lambda *_: creeping)
     refused = find_start(frames(simulation.events()), config(simulation))
