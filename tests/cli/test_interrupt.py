@@ -31,7 +31,8 @@ def test_a_signal_leaves_what_may_be_left_out_and_asks_those_around(number: sign
 @pytest.mark.parametrize("number", ASKING)
 def test_a_signal_while_a_command_is_imported_is_an_interruption(number: signal.Signals, tmp_path: Path) -> None:
     code = f"""
-import os, sys
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which what runs in the background may have off
 class Interrupted:
     def find_spec(self, name, path=None, target=None):
         if name == "boxplus.cli.lidar.lio":

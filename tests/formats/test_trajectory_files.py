@@ -127,7 +127,7 @@ def write_lines(path: Path, lines: list[str], end: str = "\n") -> Path:
             ["1403715529112143517 0 0 0 0 0 0 1"],
             r"not a time in seconds \(nanoseconds or milliseconds\? divide them\) \(.*, line 1\)",
         ),
-        (["1 2 3"], r"expected a trajectory in TUM .*'1 2 3' \(.*\) – convert the file"),
+        (["1 2 3"], r"expected a trajectory in TUM .*'1 2 3' \(.*\) – give a file in one of these formats"),
         (["# only a comment"], r"at least one pose – got none"),
         ([" ".join(["2"] * 12)], r"rotation matrices .* 11 off|rotation matrices"),
         (["1.5,0,0,0,1,0,0,0"], r"'1.5' is not a whole number of nanoseconds \(.*, line 1\)"),
