@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +18,17 @@ from boxplus.evaluation.rpe import Delta
 from boxplus.formats.trajectory import read_trajectory, write_kitti, write_tum
 from tests.evaluation.smooth_paths import SmoothPath, disturbed, moved
 
+pytestmark = pytest.mark.slow
+
 # evo keeps stamps as floats, 0.24 microseconds apart at today's dates: no stamp here lies that close to the middle of two.
 PRINTED = 6e-7  # six decimals: half of the last one, and the rounding of two programs
 
 
 def tool(name: str, *arguments: str) -> tuple[dict[str, float], str]:
     """Figures that evo prints for the same files, and all of its text."""
-    program = shutil.which(name)
+    program = shutil.which(name, path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
     if program is None:
-        pytest.skip(f"{name} (pip install evo) is not on the path")
+        pytest.skip(f"{name} (pip install evo) is not there")
     text = subprocess.run([program, *arguments, "-v"], check=True, capture_output=True, text=True).stdout
     return {key: float(value) for key, value in re.findall(r"(rmse|mean|median|max|min|std)\s+([\d.]+)", text)}, text
 
