@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from typing import Annotated, Any
 
@@ -105,7 +105,9 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
+            result = super().invoke(ctx)
+            sys.stdout.flush()
+            return result
         except BoxplusError as error:
             print_error(str(error))
             raise typer.Exit(EXIT_BAD_INPUT if isinstance(error, InputError) else EXIT_FAILED) from None
@@ -116,6 +118,9 @@ class _Commands(TyperGroup):
             if error.errno != errno.ENOSPC or error.filename is not None:
                 raise
             print_error(f"expected to write to the standard output – got {error.strerror} – make room where it is kept")
+            # What is still to be written would be tried once more at the end, and the exit code be Python's.
+            with suppress(OSError, ValueError), open(os.devnull, "w") as nowhere:
+                os.dup2(nowhere.fileno(), sys.stdout.fileno())
             raise typer.Exit(EXIT_FAILED) from None
 
 
