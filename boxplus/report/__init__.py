@@ -65,18 +65,16 @@ def load_report(folder: str | Path) -> AnyRun:
     from boxplus.runs.slam.result import load_slam_result
     from boxplus.runs.storage.output_folder import SUMMARY, program_of
 
-    program = None
     with suppress(OSError):
         program = program_of(Path(folder) / SUMMARY)
-    if program is not None and program not in ("boxplus lio", "boxplus slam", "boxplus vio", "boxplus vo"):
-        raise _of_another(Path(folder), program)
-    with suppress(OSError):
         if program == "boxplus vio":
             return load_visual_run(folder)
         if program == "boxplus vo":
             return load_direct_run(folder)
         if program == "boxplus slam":
             return load_slam_result(folder)
+        if program not in (None, "boxplus lio"):
+            raise _of_another(Path(folder), program)
     return load_run(folder)
 
 

@@ -251,6 +251,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         statistics, start, info = self._statistics, self._odometry.start, self._recording.info
         origin = statistics.first_time_ns
         lidars = lidar_facts(self._recording, self._watch, origin)
+        sigma_deg, sigma_m = statistics.mounting_sigma if statistics.count else (None, None)
         return RunSummary(
             versions=versions("rosbags"),
             state=state,
@@ -276,8 +277,8 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
                 estimation=self._config.odometry.extrinsic_estimation,
                 T_imu_lidar_start=self._extrinsic.T_imu_lidar.tolist(),
                 T_imu_lidar_end=statistics.T_imu_lidar.tolist() if statistics.count else None,
-                sigma_end_deg=statistics.mounting_sigma[0] if statistics.count else None,
-                sigma_end_m=statistics.mounting_sigma[1] if statistics.count else None,
+                sigma_end_deg=sigma_deg,
+                sigma_end_m=sigma_m,
             ),
             lidars=lidars,
             start=None if start is None else StartFacts(kind=start.kind, text=start.text, duration_s=start.duration_s),

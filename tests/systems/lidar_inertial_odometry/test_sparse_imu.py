@@ -5,23 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus.sensors.scan import Scan
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar
 from boxplus.simulation.motions import trajectories
 from boxplus.simulation.worlds import sites, worlds
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
-from tests.systems.lidar_inertial_odometry.small_drives import config
+from tests.systems.lidar_inertial_odometry.small_drives import config, run
 
 SPARSE = ImuModel(rate_hz=10.0, gyro_noise_density=3e-4, accel_noise_density=5e-3)
 
 
 def estimates_of(simulation: Simulation) -> list[Estimate]:
     """All of them, of a run that nothing contradicts."""
-    odometry, estimates = LidarInertialOdometry(config(simulation)), []
-    for event in simulation.events():
-        estimates += odometry.push_scan(event) if isinstance(event, Scan) else odometry.push_imu(event)
-    estimates += odometry.flush()
+    odometry = LidarInertialOdometry(config(simulation))
+    estimates = run(odometry, simulation.events())
     assert odometry.contradiction is None
     return estimates
 
