@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -49,12 +49,15 @@ _FIRST = 3  # intervals between scans, of which the velocity is taken that undis
 _MUCH_SHORTER = 0.8
 _FEWEST_SAMPLES = 5
 _LARGEST_BIAS = 0.12  # rad/s, of a gyroscope that works
+_AS_FAST = 0.1  # share of a turn rate
 _CANCELLED = 0.3  # of the difference of two turns is left of their sum, where one is the other reversed: a tilt is not mirrored
 _LARGEST_MISFIT_M = 0.05  # of the batch over a moving start
+_GOOD_FIT_M, _MUCH_BETTER = 0.01, 0.3  # a misfit beyond which the opposite sign is tried, and its share that speaks for that
 _LARGEST_ACCEL_BIAS = 0.4  # m/s²: what an accelerometer in order has, as a path does not bend for no reason
 _COMMON_M_S = 0.2  # standard deviation of a speed that what changes from scan to scan shows
 _STEADY_M = 0.01  # rms about a straight line; of paths along smooth tunnels, with 3 cm of noise, up to 0.007
 _ABOUT_RAD_S = 0.3  # standard deviation of a gyroscope that is carried about
+_MIRRORED = "the points are mirrored (one axis has the wrong sign, or two are swapped)"
 _UNKNOWN_SPEED = 3.0  # m/s: standard deviation beyond which the velocity was not found
 
 
@@ -182,17 +185,25 @@ def _check_gyroscope(seen: Beginning, path: LidarPath, rest: Rest) -> None:
     bias = float(np.linalg.norm(off))
     if bias <= _LARGEST_BIAS:
         return
-    # The LiDAR turns with turn - off: opposite to the gyroscope and as fast, both cancel.
-    opposite = float(np.linalg.norm(2.0 * turn - off)) < _CANCELLED * bias
-    why = (
-        "they turn alike but in opposite senses, so the gyroscope's sign is flipped, the points are mirrored (one axis has the "
-        "wrong sign, or two are swapped), or T_imu_lidar is half a turn off"
-        if opposite
-        else "its unit, its sign, T_imu_lidar or the topics are wrong, or the LiDAR sees too little"
-    )
     raise NotYet(
-        f"the gyroscope turns by {np.degrees(bias):.1f} deg/s more than the LiDAR, which no bias explains: {why}{WAITING}"
+        f"the gyroscope turns by {np.degrees(bias):.1f} deg/s more than the LiDAR, which no bias explains: "
+        f"{_why_turns_differ(turn, turn - off)}{WAITING}"
     )
+
+
+def _why_turns_differ(gyro: NDArray[np.float64], lidar: NDArray[np.float64]) -> str:
+    """What may be wrong where gyroscope and LiDAR turn with these rates (3,) [rad/s], along the same axes as far as is known."""
+    fast, seen = float(np.linalg.norm(gyro)), float(np.linalg.norm(lidar))
+    # Opposite and as fast, both cancel.
+    if float(np.linalg.norm(gyro + lidar)) < _CANCELLED * float(np.linalg.norm(gyro - lidar)):
+        return (
+            f"they turn alike but in opposite senses, so the gyroscope's sign is flipped, {_MIRRORED}, "
+            "or T_imu_lidar is half a turn off"
+        )
+    if abs(fast - seen) < _AS_FAST * fast:
+        apart = np.degrees(np.arccos(np.clip(gyro @ lidar / (fast * seen), -1.0, 1.0)))
+        return f"they turn as fast, but about axes {apart:.0f} deg apart, so T_imu_lidar is wrong or missing, or {_MIRRORED}"
+    return "its unit, its sign, T_imu_lidar or the topics are wrong, or the LiDAR sees too little"
 
 
 def _static_start(seen: Beginning, rest: Rest, doubt: str) -> Start:
@@ -289,6 +300,8 @@ def _checked_fit(seen: Beginning, path: LidarPath) -> TranslationFit:
     fit = moving_fit(seen.frames, path, seen.imu, seen.extrinsic, seen.config)
     if fit is None:
         raise seen.not_moving("the surroundings do not show how the platform turns")
+    if fit.sigma > _GOOD_FIT_M:
+        _check_sign(seen, path, fit)
     if fit.sigma > _LARGEST_MISFIT_M:
         raise seen.not_moving(f"LiDAR and IMU do not fit better than {fit.sigma * 100:.1f} cm")
     bias = float(np.linalg.norm(fit.bias))
@@ -298,6 +311,17 @@ def _checked_fit(seen: Beginning, path: LidarPath) -> TranslationFit:
             "accelerometer is bad"
         )
     return fit
+
+
+def _check_sign(seen: Beginning, path: LidarPath, fit: TranslationFit) -> None:
+    """Whether the path fits the accelerometer much better with the opposite sign."""
+    opposite = replace(seen.imu, accel=-seen.imu.accel)
+    flipped = moving_fit(seen.frames, path, opposite, seen.extrinsic, seen.config)
+    if flipped is not None and flipped.sigma < _MUCH_BETTER * fit.sigma:
+        raise seen.not_moving(
+            f"LiDAR and IMU fit to {flipped.sigma * 100:.1f} cm with the accelerometer's sign flipped, and to no more than "
+            f"{fit.sigma * 100:.1f} cm as it is: its sign is wrong (at rest it is to show +9.8 m/s² upwards)"
+        )
 
 
 def _checked_speed(seen: Beginning, state: NavState, covariance: NDArray[np.float64]) -> float:

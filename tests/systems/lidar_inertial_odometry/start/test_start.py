@@ -17,6 +17,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, simulate
+from boxplus.simulation.faults import flip_accel
 from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.motions.spline import Trajectory
 from boxplus.simulation.worlds import sites, worlds
@@ -285,6 +286,17 @@ def test_a_moving_start_that_asks_for_a_bias_that_no_accelerometer_in_order_has_
         assert named is not None and 0.4 < float(named[1]) < 1.1
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_an_accelerometer_with_the_opposite_sign_is_named_in_motion(seed: int) -> None:
+    """The path of a lively hand fits it to millimetres one way, to centimetres the other; of a sound one nothing is said."""
+    motion = manoeuvres.handheld(3.0, (-4.0, -3.0, 0.5), (-2.0, -1.0, 2.5), 2.0, 0.3, standstill_s=0.0, seed=seed)
+    simulation = _steady(motion)
+    sound = find_start(frames(simulation.events()), config(simulation))
+    flipped = find_start(frames(flip_accel().events(simulation.events())), config(simulation))
+    assert isinstance(sound, Start) and sound.kind == "moving"
+    assert isinstance(flipped, str) and "with the accelerometer's sign flipped" in flipped
+
+
 def test_scans_that_do_not_overlap_are_refused() -> None:
     simulation = room_walk(1.5)
     apart = []
@@ -351,3 +363,14 @@ def test_a_gyroscope_that_turns_the_other_way_is_told_from_one_in_other_units() 
     assert all(isinstance(refusal, str) for refusal in refusals)
     assert "in opposite senses" in str(refusals[0])
     assert "opposite" not in str(refusals[1])
+
+
+def test_a_mounting_that_is_tilted_is_told_from_a_unit() -> None:
+    """On the spot at 90 deg/s, with a mounting that is 25 degrees off: both turn as fast, about other axes."""
+    simulation = simulate("spin", duration_s=3.0, lidar=LIDAR)
+    tilt = np.eye(4)
+    tilt[:3, :3] = so3.exp(np.array([np.deg2rad(25.0), 0.0, 0.0]))
+    wrong = config(simulation, T_imu_lidar=tuple(map(tuple, (simulation.T_imu_lidar @ tilt).tolist())))
+    refusal = find_start(frames(simulation.events())[-9:], wrong)
+    named = re.search(r"they turn as fast, but about axes (\d+) deg apart, so T_imu_lidar is wrong", str(refusal))
+    assert named is not None and 20 <= int(named[1]) <= 30
