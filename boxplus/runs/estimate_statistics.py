@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.runs.run_facts import Distribution, Gap, WarningFacts, WeakInterval
+from boxplus.sensors.sequencer import BEYOND, NOT_FINITE
 
 _MOST_ENTRIES = 1000
 _GAP_FACTOR = 3.0
 _INTERVALS_FOR_TYPICAL = 50
+_NO_MEASUREMENTS = {NOT_FINITE: "are no numbers (NaN or infinite)", BEYOND: "are beyond what any sensor measures"}
 _NUMBER = re.compile(r"[-+]?\d+(\.\d+)?")
 
 
@@ -152,6 +154,22 @@ class EstimateStatistics:
                 text = f"{count} of {self.count} {self.unit} are {status}; the longest stretch, from {when}, {longest.text}"
                 found.append(WarningFacts(text=text, count=1, first_s=intervals[0].begin_s))
         return found
+
+    def imu_warnings(self, counters: Mapping[str, int]) -> list[WarningFacts]:
+        """A warning for each kind of samples that no sensor in order delivers.
+
+        Args:
+            counters: reason → rejected samples.
+        """
+        return [
+            WarningFacts(
+                text=f"{counters[reason]} of {self.imu_samples_read} IMU samples {what} and were left out: a sensor in order "
+                "and its driver deliver none such",
+                count=1,
+            )
+            for reason, what in _NO_MEASUREMENTS.items()
+            if counters.get(reason)
+        ]
 
     @property
     def duration_s(self) -> float:

@@ -13,10 +13,12 @@ import numpy as np
 
 from boxplus.sensors.checked import checked_imu, checked_scan
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.imu_values import ACCEL_LIMIT, GYRO_LIMIT, beyond, finite
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.time_steps import TimeSteps
 
-_GYRO_LIMIT, _ACCEL_LIMIT = 100.0, 400.0  # rad/s, m/s²: more than any IMU on a robot measures
+NOT_FINITE, BEYOND = "IMU sample not finite", "IMU sample beyond any sensor"
+"""Of samples that a sensor in order, and its driver, never deliver."""
 _EARLIER = 1.5  # intervals between samples: as long before the first one its values are held
 
 
@@ -102,22 +104,19 @@ class Sequencer:
     def _in_order(self, samples: ImuSamples) -> bool:
         """Whether nothing is wrong with any sample: the usual case, which costs no loop. NaN compares false."""
         last, time = self._last_imu_ns, samples.time_ns
-        if not (np.abs(samples.gyro).max() <= _GYRO_LIMIT and np.abs(samples.accel).max() <= _ACCEL_LIMIT):
+        if not (np.abs(samples.gyro).max() <= GYRO_LIMIT and np.abs(samples.accel).max() <= ACCEL_LIMIT):
             return False
         steps = np.diff(time if last is None else np.concatenate([[last], time]))
         return not len(steps) or bool(steps.min() > 0 and steps.max() <= self._max_jump_ns)
 
     def _add_one_by_one(self, samples: ImuSamples) -> None:
-        finite = np.isfinite(samples.gyro).all(axis=1) & np.isfinite(samples.accel).all(axis=1)
-        self.rejected["IMU sample not finite"] += int((~finite).sum())
-        # NaN compares false, so what is not finite is not counted twice.
-        beyond = (np.abs(samples.gyro) > _GYRO_LIMIT).any(axis=1) | (np.abs(samples.accel) > _ACCEL_LIMIT).any(axis=1)
-        if (beyond & finite).any():
-            self.rejected["IMU sample beyond any sensor"] += int((beyond & finite).sum())
-        finite &= ~beyond
+        numbers, too_large = finite(samples), beyond(samples)
+        self.rejected[NOT_FINITE] += int((~numbers).sum())
+        if (too_large & numbers).any():  # what is not finite is not counted twice
+            self.rejected[BEYOND] += int((too_large & numbers).sum())
         time = samples.time_ns
         keep = np.zeros(len(samples), dtype=bool)
-        for i in np.flatnonzero(finite):
+        for i in np.flatnonzero(numbers & ~too_large):
             now, last = int(time[i]), self._last_imu_ns
             if last is not None and now == last:
                 self.rejected["IMU sample with a repeated time"] += 1

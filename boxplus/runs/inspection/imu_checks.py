@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from boxplus.recordings.imu_units import STANDARD_GRAVITY
 from boxplus.recordings.info import Evidence
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.imu_values import beyond, finite
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
 
 _WINDOW_S = 0.5
@@ -137,13 +138,12 @@ def check_saturation(imu: ImuSamples) -> Evidence:
 
 
 def check_finite(imu: ImuSamples) -> list[Evidence]:
-    """IMU samples that are not numbers."""
-    bad = int((~(np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1))).sum())
-    return (
-        [Evidence("imu_values", f"{bad} not finite", "warning", f"of {len(imu)} samples: dropped, which leaves gaps")]
-        if bad
-        else []
-    )
+    """IMU samples that are not numbers, or larger than what any sensor measures."""
+    kinds = ((~finite(imu), "not finite"), (beyond(imu), "beyond any sensor"))
+    bad = [f"{np.count_nonzero(mask)} {kind}" for mask, kind in kinds if mask.any()]
+    if not bad:
+        return []
+    return [Evidence("imu_values", ", ".join(bad), "warning", f"of {len(imu)} samples: dropped, which leaves gaps")]
 
 
 def liveliest_stretch(imu: ImuSamples, seconds: float, first: float = 0.0, last: float = 1.0) -> tuple[int, int]:

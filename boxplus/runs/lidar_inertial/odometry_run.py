@@ -312,6 +312,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
                 *(WarningFacts(text=text, count=1) for text in self._odometry.time_steps),
                 *lidar_warnings(lidars, self._recording.time_steps),
                 *statistics.status_warnings(),
+                *statistics.imu_warnings(self._odometry.counters),
                 *statistics.late_start_warnings(self._odometry.counters.get(BEFORE_START, 0), self._odometry.start_problem),
                 *statistics.vague_warnings(self._mounting_sigma),
                 *statistics.warnings.facts(origin),

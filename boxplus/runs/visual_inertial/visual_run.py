@@ -242,6 +242,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         counts, start = self.counts, self._odometry.start
         shared = self.shared_facts(state, error, with_imu=True)
         shared["warnings"] += self._gap_warnings()
+        shared["warnings"] += counts.imu_warnings(self._odometry.counters)
         repeated = self._odometry.counters.get(REPEATED, 0)
         if repeated:
             text = f"{repeated} {REPEATED}: a driver or the recording delivers images again with new stamps; they are left out"

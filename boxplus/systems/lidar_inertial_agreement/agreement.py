@@ -23,6 +23,7 @@ from boxplus.manifolds import so3
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.imu_values import beyond, finite
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import surer_path
@@ -49,6 +50,7 @@ LAG_RAD = float(np.deg2rad(2.5))
 
 _COARSELY_RAD = 0.2
 _DECLARED_ARM_STD = 0.02  # m
+_GLITCHES = 0.01  # share of the samples
 _ENOUGH_SAMPLES = 3.0  # of the IMU from scan to scan: with fewer it misses part of the motion in between
 
 
@@ -258,10 +260,15 @@ def gyro_guesses(imu: ImuSamples, R_imu_lidar: NDArray[np.float64]) -> list[Turn
 
 
 def usable(imu: ImuSamples) -> ImuSamples:
-    """Finite samples in order of time, each time once."""
-    finite = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
-    _, first = np.unique(imu.time_ns[finite], return_index=True)
-    return ImuSamples(imu.time_ns[finite][first], imu.gyro[finite][first], imu.accel[finite][first])
+    """Samples that can be measurements, in order of time, each time once.
+
+    Few that are larger than any sensor measures are none; where they are many, the unit is in question, and they stay.
+    """
+    keep, too_large = finite(imu), beyond(imu)
+    if np.count_nonzero(too_large) < _GLITCHES * len(imu):
+        keep &= ~too_large
+    _, first = np.unique(imu.time_ns[keep], return_index=True)
+    return ImuSamples(imu.time_ns[keep][first], imu.gyro[keep][first], imu.accel[keep][first])
 
 
 def unit_of(scale: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,16 @@ from hypothesis import strategies as st
 
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.manifolds import so3
+from boxplus.runs.lidar_inertial.config import MapConfig, RunConfig
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.lidar_inertial.statistics import RunStatistics
+from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.simulation import SpinningLidar, simulate
+from boxplus.simulation import Fault, SpinningLidar, simulate
+from boxplus.simulation.faults import Event, nan_burst
 from boxplus.simulation.live_recording import as_recording
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Status
+from tests.systems.lidar_inertial_odometry.small_drives import room_walk
 
 
 def estimate(scan: int, p: np.ndarray, P: np.ndarray, status: Status = "ok") -> Estimate:
@@ -92,6 +97,34 @@ def test_scans_without_a_pose_are_told(unstarted: int) -> None:
         assert told[0].text.startswith("65 of the 80 scans that were read have no pose: no start was found sooner, ")
         assert "begin 6.5 s after the first scan" in told[0].text
         assert told[0].text.endswith("where walls are near. Just before: not at rest, and one wall says little")
+
+
+def _one_beyond(events: Iterable[Event]) -> Iterator[Event]:
+    """The hundredth sample turns by 500 rad/s."""
+    read = 0
+    for event in events:
+        if isinstance(event, ImuSamples):
+            gyro = event.gyro.copy()
+            if read <= 100 < read + len(event):
+                gyro[100 - read] = 500.0
+            read += len(event)
+            event = ImuSamples(event.time_ns, gyro, event.accel)
+        yield event
+
+
+def test_samples_that_are_no_measurements_are_told(tmp_path: Path) -> None:
+    """A run ended without a word of them, but for a table of the report."""
+    fault = nan_burst(1.0, 0.3).then(Fault("beyond", "a rate beyond any sensor", _one_beyond))
+    simulation = room_walk(2.5)
+    sound, spoilt = (
+        run_odometry(as_recording(simulation, spoiling), tmp_path / name, RunConfig(map=MapConfig(save=False)))
+        for spoiling, name in ((None, "sound"), (fault, "spoilt"))
+    )
+    assert sound.warnings == []
+    told, read = [warning.text for warning in spoilt.warnings], spoilt.imu_samples_read
+    assert len(told) == 2
+    assert told[0].startswith(f"30 of {read} IMU samples are no numbers (NaN or infinite) and were left out: ")
+    assert told[1].startswith(f"1 of {read} IMU samples are beyond what any sensor measures and were left out: ")
 
 
 @pytest.mark.slow
