@@ -11,12 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.runs.run_facts import Distribution, Gap, WarningFacts, WeakInterval
-from boxplus.sensors.sequencer import BEYOND, NOT_FINITE
+from boxplus.sensors.sequencer import BEYOND, EMPTY, GLITCH, NOT_FINITE
 
 _MOST_ENTRIES = 1000
 _GAP_FACTOR = 3.0
 _INTERVALS_FOR_TYPICAL = 50
-_NO_MEASUREMENTS = {NOT_FINITE: "are no numbers (NaN or infinite)", BEYOND: "are beyond what any sensor measures"}
+_NO_MEASUREMENTS = {
+    NOT_FINITE: "are no numbers (NaN or infinite)",
+    BEYOND: "are beyond what any sensor measures",
+    EMPTY: "are zero throughout",
+    GLITCH: "stand out from both of their neighbours as no motion does",
+}
 _NUMBER = re.compile(r"[-+]?\d+(\.\d+)?")
 
 

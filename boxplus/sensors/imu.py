@@ -68,6 +68,10 @@ class ImuSamples:
             np.concatenate([block.accel for block in blocks]),
         )
 
+    def where(self, which: NDArray[np.bool_] | NDArray[np.int64] | slice) -> ImuSamples:
+        """Some of the samples: those of a mask, of indices, or of a slice."""
+        return ImuSamples(self.time_ns[which], self.gyro[which], self.accel[which])
+
     def __len__(self) -> int:
         return int(self.time_ns.size)
 

@@ -13,11 +13,12 @@ import numpy as np
 
 from boxplus.sensors.checked import checked_imu, checked_scan
 from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import ACCEL_LIMIT, GYRO_LIMIT, beyond, finite
+from boxplus.sensors.imu_values import ACCEL_LIMIT, GYRO_LIMIT, beyond, empty, finite, glitches
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.time_steps import TimeSteps
 
 NOT_FINITE, BEYOND = "IMU sample not finite", "IMU sample beyond any sensor"
+EMPTY, GLITCH = "IMU sample of zeros", "IMU sample unlike both of its neighbours"
 """Of samples that a sensor in order, and its driver, never deliver."""
 _EARLIER = 1.5  # intervals between samples: as long before the first one its values are held
 
@@ -106,17 +107,21 @@ class Sequencer:
         last, time = self._last_imu_ns, samples.time_ns
         if not (np.abs(samples.gyro).max() <= GYRO_LIMIT and np.abs(samples.accel).max() <= ACCEL_LIMIT):
             return False
+        if empty(samples).any():
+            return False
         steps = np.diff(time if last is None else np.concatenate([[last], time]))
         return not len(steps) or bool(steps.min() > 0 and steps.max() <= self._max_jump_ns)
 
     def _add_one_by_one(self, samples: ImuSamples) -> None:
-        numbers, too_large = finite(samples), beyond(samples)
+        numbers, too_large, zero = finite(samples), beyond(samples), empty(samples)
         self.rejected[NOT_FINITE] += int((~numbers).sum())
         if (too_large & numbers).any():  # what is not finite is not counted twice
             self.rejected[BEYOND] += int((too_large & numbers).sum())
+        if zero.any():
+            self.rejected[EMPTY] += int(zero.sum())
         time = samples.time_ns
         keep = np.zeros(len(samples), dtype=bool)
-        for i in np.flatnonzero(numbers & ~too_large):
+        for i in np.flatnonzero(numbers & ~too_large & ~zero):
             now, last = int(time[i]), self._last_imu_ns
             if last is not None and now == last:
                 self.rejected["IMU sample with a repeated time"] += 1
@@ -141,7 +146,7 @@ class Sequencer:
             keep[i] = True
         self._imu_taken += int(keep.sum())
         if keep.any():
-            self._imu.append(ImuSamples(time[keep], samples.gyro[keep], samples.accel[keep]))
+            self._imu.append(samples.where(keep))
 
     def add_scan(self, scan: Scan) -> None:
         """Take a scan in; one that is empty, or does not end after the one before, is counted and left out.
@@ -208,7 +213,7 @@ class Sequencer:
         """Samples from the last one at or before `time_ns` on; they stay in the sequencer."""
         block = self._joined()
         first = max(int(np.searchsorted(block.time_ns, time_ns, side="right")) - 1, 0)
-        return ImuSamples(block.time_ns[first:], block.gyro[first:], block.accel[first:])
+        return block.where(slice(first, None))
 
     def _frame(self, scan: Scan, covered: bool) -> Frame | None:
         begin = scan.start_ns if self._last_end_ns is None else self._last_end_ns
@@ -236,12 +241,18 @@ class Sequencer:
     def _take_until(self, begin_ns: int, end_ns: int) -> ImuSamples:
         """Samples from the last at or before `begin_ns` to the first at or after `end_ns`; older ones are forgotten."""
         block = self._joined()
-        first = max(int(np.searchsorted(block.time_ns, begin_ns, side="right")) - 1, 0)
         stop = min(int(np.searchsorted(block.time_ns, end_ns, side="left")) + 1, len(block))
+        odd = glitches(block.where(slice(stop)))
+        unsure = bool(stop) and bool(odd[-1])  # of the last sample the next one will tell
+        odd[-1:] = False
+        if odd.any():
+            self.rejected[GLITCH] += int(odd.sum())
+            block = block.where(np.concatenate([~odd, np.ones(len(block) - stop, dtype=bool)]))
+            stop -= int(odd.sum())
+        first = max(int(np.searchsorted(block.time_ns, begin_ns, side="right")) - 1, 0)
         # Two samples at or before the end stay: the next frame needs the last one before its begin.
-        keep = max(stop - 2, 0)
-        self._imu = deque([ImuSamples(block.time_ns[keep:], block.gyro[keep:], block.accel[keep:])])
-        return ImuSamples(block.time_ns[first:stop], block.gyro[first:stop], block.accel[first:stop])
+        self._imu = deque([block.where(slice(max(stop - 2, 0), None))])
+        return block.where(slice(first, stop - 1 if unsure and stop - 1 > first else stop))
 
     def _joined(self) -> ImuSamples:
         """All samples kept, as one block."""

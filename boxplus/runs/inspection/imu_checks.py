@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from boxplus.recordings.imu_units import STANDARD_GRAVITY
 from boxplus.recordings.info import Evidence
 from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import beyond, finite
+from boxplus.sensors.imu_values import beyond, empty, finite, glitches
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
 
 _WINDOW_S = 0.5
@@ -138,8 +138,13 @@ def check_saturation(imu: ImuSamples) -> Evidence:
 
 
 def check_finite(imu: ImuSamples) -> list[Evidence]:
-    """IMU samples that are not numbers, or larger than what any sensor measures."""
-    kinds = ((~finite(imu), "not finite"), (beyond(imu), "beyond any sensor"))
+    """IMU samples that no sensor in order delivers."""
+    kinds = (
+        (~finite(imu), "not finite"),
+        (beyond(imu), "beyond any sensor"),
+        (empty(imu), "zero throughout"),
+        (glitches(imu), "unlike both of their neighbours"),
+    )
     bad = [f"{np.count_nonzero(mask)} {kind}" for mask, kind in kinds if mask.any()]
     if not bad:
         return []

@@ -23,7 +23,7 @@ from boxplus.manifolds import so3
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import beyond, finite
+from boxplus.sensors.imu_values import beyond, empty, finite, glitches
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import surer_path
@@ -262,13 +262,15 @@ def gyro_guesses(imu: ImuSamples, R_imu_lidar: NDArray[np.float64]) -> list[Turn
 def usable(imu: ImuSamples) -> ImuSamples:
     """Samples that can be measurements, in order of time, each time once.
 
-    Few that are larger than any sensor measures are none; where they are many, the unit is in question, and they stay.
+    Few that are larger than any sensor measures are none; where they are many, the unit is in question, and they stay. One that
+    stands out from both of its neighbours is none either.
     """
-    keep, too_large = finite(imu), beyond(imu)
+    keep, too_large = finite(imu) & ~empty(imu), beyond(imu)
     if np.count_nonzero(too_large) < _GLITCHES * len(imu):
         keep &= ~too_large
-    _, first = np.unique(imu.time_ns[keep], return_index=True)
-    return ImuSamples(imu.time_ns[keep][first], imu.gyro[keep][first], imu.accel[keep][first])
+    imu = imu.where(keep)
+    ordered = imu.where(np.unique(imu.time_ns, return_index=True)[1])
+    return ordered.where(~glitches(ordered))
 
 
 def unit_of(scale: float) -> float:
