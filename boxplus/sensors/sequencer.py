@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from boxplus.sensors.checked import checked_imu, checked_scan
 from boxplus.sensors.imu import ImuSamples
@@ -20,6 +21,7 @@ from boxplus.sensors.time_steps import TimeSteps
 NOT_FINITE, BEYOND = "IMU sample not finite", "IMU sample beyond any sensor"
 EMPTY, GLITCH = "IMU sample of zeros", "IMU sample unlike both of its neighbours"
 """Of samples that a sensor in order, and its driver, never deliver."""
+_COMPARED = 500  # points, of scans that have as many
 _EARLIER = 1.5  # intervals between samples: as long before the first one its values are held
 
 
@@ -49,6 +51,8 @@ class Frame:
 
 BEFORE_START = "scan before a start could be found"
 """Why an odometry that could not begin gave up a scan, among what was rejected."""
+REPEATED = "scan with all points of the one before"
+"""A driver, or the recording, delivers it again with new stamps."""
 AFTER_GAP = "scan after a gap, before another start could be found"
 """The same of one that could not go on."""
 
@@ -77,6 +81,7 @@ class Sequencer:
         self._scan_jumps = 0
         self._imu_taken = 0
         self._scans_taken = 0
+        self._newest_points: bytes | None = None  # some of the scan before, where it was no repetition itself
         self._imu_steps, self._scan_steps = TimeSteps("IMU"), TimeSteps("LiDAR")
 
     @property
@@ -182,11 +187,24 @@ class Sequencer:
                 self._scan_jumps += 1
                 self.rejected["scan jumping ahead in time"] += 1
                 return
+        if self._repeats(scan.p_lidar):
+            self.rejected[REPEATED] += 1
+            return
         self._scan_jumps = 0
         self._scans_taken += 1
         self._scan_steps.went_on()
         self._newest_scan_end_ns = scan.end_ns
         self._scans.append(scan)
+
+    def _repeats(self, p_lidar: NDArray[np.float32]) -> bool:
+        """Whether these are the points of the scan before, to the bit.
+
+        Never of two scans in a row: a simulated LiDAR without noise gives the same points as long as it rests.
+        """
+        some = p_lidar[:: len(p_lidar) // _COMPARED].tobytes() if len(p_lidar) >= _COMPARED else None
+        repeats = some is not None and some == self._newest_points
+        self._newest_points = None if repeats else some
+        return repeats
 
     def frames(self, *, flush: bool = False) -> list[Frame]:
         """The frames that are complete by now; with `flush`, also those that never will be."""

@@ -12,7 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.sensors.sequencer import Frame, Sequencer
+from boxplus.sensors.sequencer import REPEATED, Frame, Sequencer
 
 MS = 1_000_000
 T0 = 1_700_000_000_000_000_000
@@ -318,3 +318,15 @@ def test_a_first_scan_far_ahead_does_not_shut_out_all_that_follow() -> None:
         frames += sequencer.frames()
     assert len(frames) == 3
     assert sequencer.rejected == {"scan far ahead of all that follow": 1}
+
+
+def test_a_scan_that_comes_again_with_new_stamps_is_left_out_but_never_two_in_a_row() -> None:
+    random = np.random.default_rng(3)
+    first, second = random.normal(size=(2, 3000, 3))
+    sequencer = Sequencer()
+    for index, points in enumerate((first, first, second, second, second, first, first[:2900], first)):
+        begin_ns = 100_000_000 * index
+        sequencer.add_scan(Scan.from_arrays(points, begin_ns + np.arange(len(points))))
+    taken = [scan.start_ns // 100_000_000 for scan in sequencer.take_scans()]
+    assert taken == [0, 2, 4, 5, 6, 7]
+    assert sequencer.rejected == {REPEATED: 2}

@@ -30,7 +30,7 @@ from boxplus.runs.run_folder import RunFolder, claim_run_folder
 from boxplus.runs.run_loop import Progress, peak_memory_mb, versions
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.sensors.sequencer import BEFORE_START
+from boxplus.sensors.sequencer import BEFORE_START, REPEATED
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_odometry.odometry import LidarOdometry
@@ -313,6 +313,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
                 *lidar_warnings(lidars, self._recording.time_steps),
                 *statistics.status_warnings(),
                 *statistics.imu_warnings(self._odometry.counters),
+                *statistics.repeated_warnings(self._odometry.counters.get(REPEATED, 0)),
                 *statistics.late_start_warnings(self._odometry.counters.get(BEFORE_START, 0), self._odometry.start_problem),
                 *statistics.vague_warnings(self._mounting_sigma),
                 *statistics.warnings.facts(origin),

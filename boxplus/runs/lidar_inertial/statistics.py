@@ -109,6 +109,16 @@ class RunStatistics(EstimateStatistics):
             text += f". Just before: {refusal.removesuffix(WAITING)}"
         return [WarningFacts(text=text, count=1)]
 
+    def repeated_warnings(self, repeated: int) -> list[WarningFacts]:
+        """A warning where scans came again with new stamps."""
+        if not repeated:
+            return []
+        text = (
+            f"{repeated} of the {self.scans_read} scans that were read {either(repeated, 'has', 'have')} all points of the one "
+            f"before, with new stamps, and {either(repeated, 'was', 'were')} left out: a driver delivers it again"
+        )
+        return [WarningFacts(text=text, count=repeated)]
+
     def scan_gaps(self) -> list[Gap]:
         """Intervals between the ends of scans more than three times the usual one."""
         return self._scan_gaps.gaps(self.first_time_ns or 0) if self.first_time_ns is not None else []

@@ -127,6 +127,16 @@ def test_samples_that_are_no_measurements_are_told(tmp_path: Path) -> None:
     assert told[1].startswith(f"1 of {read} IMU samples are beyond what any sensor measures and were left out: ")
 
 
+def test_scans_that_come_again_are_told() -> None:
+    statistics = straight(0.7, 0.01, np.ones(3), ("ok",) * 15)
+    statistics.scans_read = 17
+    assert statistics.repeated_warnings(0) == []
+    (warning,) = statistics.repeated_warnings(2)
+    assert warning.text.startswith(
+        "2 of the 17 scans that were read have all points of the one before, with new stamps, and were left out"
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("given", [True, False])
 def test_a_lever_arm_that_nobody_gave_is_told(tmp_path: Path, given: bool) -> None:
