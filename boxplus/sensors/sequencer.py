@@ -5,6 +5,7 @@ Everything that cannot be used is counted by reason; nothing is dropped silently
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -81,7 +82,7 @@ class Sequencer:
         self._scan_jumps = 0
         self._imu_taken = 0
         self._scans_taken = 0
-        self._newest_points: bytes | None = None  # some of the scan before, where it was no repetition itself
+        self._newest_points = ""  # digest of some of the scan before, where it was no repetition itself
         self._imu_steps, self._scan_steps = TimeSteps("IMU"), TimeSteps("LiDAR")
 
     @property
@@ -201,9 +202,11 @@ class Sequencer:
 
         Never of two scans in a row: a simulated LiDAR without noise gives the same points as long as it rests.
         """
-        some = p_lidar[:: len(p_lidar) // _COMPARED].tobytes() if len(p_lidar) >= _COMPARED else None
-        repeats = some is not None and some == self._newest_points
-        self._newest_points = None if repeats else some
+        some = ""
+        if len(p_lidar) >= _COMPARED:
+            some = hashlib.blake2b(p_lidar[:: len(p_lidar) // _COMPARED].tobytes(), digest_size=16).hexdigest()
+        repeats = bool(some) and some == self._newest_points
+        self._newest_points = "" if repeats else some
         return repeats
 
     def frames(self, *, flush: bool = False) -> list[Frame]:
