@@ -5,13 +5,14 @@ Derivation: docs/lidar_inertial_odometry.md, sections 5 to 7.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus._jit import run_chunks
+from boxplus._jit import kernel, run_chunks
 from boxplus.filtering.degeneracy import PoseDirections, pose_directions, threshold_for
 from boxplus.filtering.iterated_update import Information
 from boxplus.filtering.nav_state import PACKED, TANGENT, boxminus_into
@@ -25,6 +26,7 @@ from boxplus.filtering.plane_information import (
     USED,
     accumulate_planes,
 )
+from boxplus.filtering.small_linalg import cholesky_inverse_into
 from boxplus.maps.curved_patches import FILLED_CELLS, MEAN_LEVERAGE, PATCH, bend_planes
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
@@ -32,7 +34,7 @@ from boxplus.maps.plane_confirmation import CONFIRMING, DENSE_CELLS, LEVERAGE, c
 from boxplus.maps.plane_matching import MANY, NEIGHBOURS, PLANE, match_planes, settle_normals
 from boxplus.maps.registration_config import RegistrationConfig
 
-_CHUNK = 512
+_CHUNK = 1024
 _SAME_NEIGHBOURS = 0.05  # cells of the map a point may move and keep its neighbours
 REASONS = {
     FEW_NEIGHBOURS: "fewer than five map points near",
@@ -85,10 +87,8 @@ class PlaneMeasurement:
         self._matched_at = np.zeros(PACKED)
         self._pull = np.zeros(MEASURED_DOF)
         self._directions: PoseDirections
-        squared = np.einsum("ij,ij->i", p_lidar, p_lidar, dtype=np.float64)
-        self.lever_arm = max(float(np.sqrt(squared.mean())) if n else 1.0, 0.1)
-        towards = np.einsum("ij,i->j", p_lidar, 1.0 / np.sqrt(np.maximum(squared, 1e-12))) / max(n, 1)
-        self.facing: NDArray[np.float64] = towards
+        self.facing: NDArray[np.float64] = np.zeros(3)
+        self.lever_arm = max(_spread_into(p_lidar, self.facing) if n else 1.0, 0.1)
 
     def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
         """The information at the packed state x (36,); `rematch` searches the neighbours anew."""
@@ -127,8 +127,8 @@ class PlaneMeasurement:
         """Whether the points have moved far enough since the last search for some to have other neighbours."""
         delta = np.zeros(TANGENT)
         boxminus_into(x, self._matched_at, delta)
-        shift = float(np.linalg.norm(delta[3:6]) + np.linalg.norm(delta[18:21]) * self.lever_arm + np.linalg.norm(delta[21:24]))
-        return shift + float(np.linalg.norm(delta[:3])) * self.lever_arm > _SAME_NEIGHBOURS * self._cell
+        turned, moved, turned_on_it, moved_on_it = (math.hypot(*delta[k : k + 3]) for k in (0, 3, 18, 21))
+        return (turned + turned_on_it) * self.lever_arm + moved + moved_on_it > _SAME_NEIGHBOURS * self._cell
 
     @property
     def points(self) -> int:
@@ -181,9 +181,8 @@ class PlaneMeasurement:
             Whether any was refused or bent.
         """
         config, A, used = self._config, total[0][:6, :6], max(int(total[5][0]), 1)
-        try:
-            covariance = np.linalg.inv(A)
-        except np.linalg.LinAlgError:  # nothing at all measures some direction
+        covariance, work = np.empty((2, 6, 6))
+        if not cholesky_inverse_into(np.ascontiguousarray(A), covariance, work):  # nothing at all measures some direction
             return False
         mean_leverage = 6.0 / used
         refused = confirm_planes(
@@ -248,3 +247,18 @@ class PlaneMeasurement:
         self._matched = True
         settle_normals(x, self._p_lidar, config.plane_threshold, self._planes, self._fate)
         self._matched_at = x.copy()
+
+
+@kernel
+def _spread_into(p_lidar: NDArray[np.float32], facing: NDArray[np.float64]) -> float:
+    """Root mean square distance of points (n, 3); `facing` (3,), zero, receives the mean of the unit vectors towards them."""
+    total = 0.0
+    for n in range(len(p_lidar)):
+        x, y, z = np.float64(p_lidar[n, 0]), np.float64(p_lidar[n, 1]), np.float64(p_lidar[n, 2])
+        squared = x * x + y * y + z * z
+        total += squared
+        share = 1.0 / (math.sqrt(max(squared, 1e-12)) * len(p_lidar))
+        facing[0] += share * x
+        facing[1] += share * y
+        facing[2] += share * z
+    return math.sqrt(total / len(p_lidar))

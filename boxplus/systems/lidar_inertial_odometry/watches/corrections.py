@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.filtering.nav_state import T_V
+from boxplus.filtering.small_linalg import symmetric_eigen_into
 from boxplus.systems.lidar_inertial_odometry.mounted_update import MountedUpdate
 from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import MOUNTING
 
@@ -81,7 +82,8 @@ class Corrections:
             return 0.0, 0.0, 0.0
         begin = kept[-1]
         moved = self._moved - begin.moved
-        values, axes = np.linalg.eigh(self._covariance - begin.covariance + moved @ begin.mounting @ moved.T)
+        values, axes = np.empty(3), np.empty((3, 3))
+        symmetric_eigen_into(self._covariance - begin.covariance + moved @ begin.mounting @ moved.T, values, axes)
         total = self._sum - begin.corrections
         squared = (axes.T @ total) ** 2 / (np.maximum(values, 0.0) + _FLOOR**2)
         return float(np.sqrt(squared.sum())), now - begin.at_s, float(np.linalg.norm(total))

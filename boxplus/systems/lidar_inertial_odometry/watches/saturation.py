@@ -40,6 +40,8 @@ class Saturation:
         joined = np.vstack([self._last, values])
         self._last, self._last_ns = joined[-(_LONG - 1) :], int(imu.time_ns[-1])
         highest = values.max(axis=0)
+        if (highest < self._peak * (1.0 - _SAME)).all():  # no plateau ends among these samples
+            return []
         self._plateaus[highest > self._peak * (1.0 + _SAME)] = 0
         np.maximum(self._peak, highest, out=self._peak)
         at_peak = joined >= self._peak * (1.0 - _SAME)

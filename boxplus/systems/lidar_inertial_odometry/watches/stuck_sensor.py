@@ -64,6 +64,8 @@ class StuckSensor:
 
     def _stuck_since(self, axes: slice, other: slice, noise: float) -> int | None:
         """The sample since which a sensor repeats itself, if that is long enough and the other sensor has noise."""
+        if len(self._values) < _FEWEST or (self._values[-1, axes] != self._values[-2, axes]).any():
+            return None
         differs = np.flatnonzero((self._values[:, axes] != self._values[-1, axes]).any(axis=1))
         begin = int(differs[-1]) + 1 if len(differs) else 0
         seconds = float(self._time_ns[-1] - self._time_ns[begin]) * 1e-9
