@@ -7,6 +7,9 @@ grows: undersides of stairs by 0.2 to 1.6 cm (3 cm of range noise), all the same
 next scan sees there is a fair sample. The first point serves until then, and for good where no other comes soon: a point that
 is replaced long after would move the map with the drift of the estimate.
 
+Most points of a scan fall into cells that hold a point already. Which those are is kept in a table of cells (one place for each,
+the cell that came last has it), so that these points need not ask the tree.
+
 Source: docs/lidar_inertial_odometry.md, section 9.
 """
 
@@ -19,6 +22,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.known_planes import KnownPlanes, place_of
 
 _SOON_NS = 1_000_000_000
 _INDEX_BITS = np.uint64(20)
@@ -26,6 +30,7 @@ _INDEX = np.int64(0xFFFFF)
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)  # an odd factor whose product's upper bits depend on all bits of a key
 _EMPTY = np.uint32(0xFFFFFFFF)
 _ONE = np.uint64(1)
+_TAKEN_BITS, _NO_CELL = 16, np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
 @kernel
@@ -65,18 +70,42 @@ def _meet(
             waited[n] = met[table[slot]] = True
 
 
+@kernel
+def _are_taken(cells: NDArray[np.uint64], table: NDArray[np.uint64], taken: NDArray[np.bool_]) -> None:
+    """Which of `cells` (n,) are in the table of those that hold a point."""
+    for n in range(len(cells)):
+        taken[n] = table[place_of(cells[n], len(table))] == cells[n]
+
+
+@kernel
+def _take(cells: NDArray[np.uint64], table: NDArray[np.uint64]) -> None:
+    """`cells` (n,) hold a point from now on."""
+    for n in range(len(cells)):
+        table[place_of(cells[n], len(table))] = cells[n]
+
+
 class FirstArrivals:
     """What was the first in its cell of a downsampled map, for a second.
 
     Args:
         largest_cell: side of the map's cells, which may be halved from scan to scan [m].
+
+    Attributes:
+        planes: of the map, for its measurements; where a scan changes the map they are forgotten.
     """
 
     def __init__(self, largest_cell: float) -> None:
+        self.planes = KnownPlanes()
         self._largest_cell = largest_cell
         self._cells = np.empty(0, np.uint64)
         self._points = np.empty((0, 3))
         self._time_ns = np.empty(0, np.int64)
+        self._taken, self._taken_side = np.full(1 << _TAKEN_BITS, _NO_CELL), largest_cell
+
+    def forget_map(self) -> None:
+        """The map has lost points otherwise than here: nothing is known of its cells."""
+        self.planes.forget_all()
+        self._taken[:] = _NO_CELL
 
     def insert_into(self, tree: IkdTree, p_world: NDArray[np.float64], time_ns: int) -> tuple[int, int]:
         """Insert a scan into the map; how many of its points were stored, and how many of these in the place of others.
@@ -86,16 +115,26 @@ class FirstArrivals:
             p_world: (n, 3) [m]; time_ns: when they were measured.
         """
         self._keep(time_ns - self._time_ns <= _SOON_NS)
-        cells = self._in_cells(p_world, tree.cell_size or self._largest_cell)
+        side = tree.cell_size or self._largest_cell
+        if side != self._taken_side:  # a point that made room for another may have left a smaller cell empty
+            self._taken[:] = _NO_CELL
+            self._taken_side = side
+        cells = self._in_cells(p_world, side)
         waited, again = self._seen_again(cells)
+        self.planes.forget_near(self._points[again])
         tree.delete_points(self._points[again])
         self._keep(~again)
-        stored = tree.insert(p_world, downsample=True).stored
-        first = stored & ~waited
+        taken = np.empty(len(cells), np.bool_)
+        _are_taken(cells, self._taken, taken)
+        asked = np.flatnonzero(~taken | waited)
+        stored = asked[tree.insert(p_world[asked], downsample=True).stored]
+        _take(cells[asked], self._taken)
+        self.planes.forget_near(p_world[stored])
+        first = stored[~waited[stored]]
         self._cells = np.concatenate([self._cells, cells[first]])
         self._points = np.concatenate([self._points, p_world[first]])
-        self._time_ns = np.concatenate([self._time_ns, np.full(np.count_nonzero(first), time_ns)])
-        return int(np.count_nonzero(stored)), int(np.count_nonzero(again))
+        self._time_ns = np.concatenate([self._time_ns, np.full(len(first), time_ns)])
+        return len(stored), int(np.count_nonzero(again))
 
     def _in_cells(self, p_world: NDArray[np.float64], cell: float) -> NDArray[np.uint64]:
         cells = np.empty(len(p_world), np.uint64)
@@ -110,4 +149,5 @@ class FirstArrivals:
         return waited, again
 
     def _keep(self, which: NDArray[np.bool_]) -> None:
-        self._cells, self._points, self._time_ns = self._cells[which], self._points[which], self._time_ns[which]
+        if not which.all():
+            self._cells, self._points, self._time_ns = self._cells[which], self._points[which], self._time_ns[which]

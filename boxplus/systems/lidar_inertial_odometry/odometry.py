@@ -84,8 +84,7 @@ class LidarInertialOdometry(Snapshots):
         self._voxel_filter = VoxelFilter(self.config.scan_voxel, self.config.max_points)
         self._box, self._excitation = SlidingBox(self.config.box_side, self.config.detection_range), RotationExcitation()
         self._standstill: Standstill | None = None
-        self._unshown = UnshownMotion()
-        self._weak_spell = WeakSpell(self.config.weak_threshold)
+        self._unshown, self._weak_spell = UnshownMotion(), WeakSpell(self.config.weak_threshold)
         self._consistency, self._long_baseline = Consistency(self.config, live=self._live), LongBaseline(self.config)
         self._saturation, self._unstarted = Saturation(), UnstartedScans(self.config)
         self._warnings: list[str] = []
@@ -183,8 +182,7 @@ class LidarInertialOdometry(Snapshots):
         self._consistency, self._long_baseline = Consistency(self.config, live=self._live), LongBaseline(self.config)
         self.start, self._standstill = None, None
         self.map, self._arrivals = IkdTree(cell_size=self.config.map_cell), FirstArrivals(self.config.map_cell)
-        self._box = SlidingBox(self.config.box_side, self.config.detection_range)
-        self._excitation = RotationExcitation()
+        self._box, self._excitation = SlidingBox(self.config.box_side, self.config.detection_range), RotationExcitation()
         return after_gap(frame)
 
     def _try_start(self) -> list[Estimate]:
@@ -333,6 +331,7 @@ class LidarInertialOdometry(Snapshots):
         state = NavState.unpack(self._x)
         for low, high in self._box.follow(state.p_world_imu + state.R_world_imu @ state.p_imu_lidar):
             self.map.delete_box(low, high)
+            self._arrivals.forget_map()
 
     def _thinned(self, p_lidar: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Centroids and representatives of a scan; the map's cells become those that suit it."""
@@ -342,9 +341,11 @@ class LidarInertialOdometry(Snapshots):
         return points, map_points
 
     def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:
-        with_extrinsic = self.config.extrinsic_estimation != "off"
+        with_extrinsic, known = self.config.extrinsic_estimation != "off", self._arrivals.planes
         weight = _BLIND_WEIGHT if self._is_blind(frame) else 1.0
-        return PlaneMeasurement(points, self.map, self.config, with_extrinsic=with_extrinsic, weight=weight, confirm=True)
+        return PlaneMeasurement(
+            points, self.map, self.config, with_extrinsic=with_extrinsic, weight=weight, confirm=True, known=known
+        )
 
     def _is_blind(self, frame: Frame) -> bool:
         return frame.largest_gap_s > self.config.max_imu_gap
@@ -367,8 +368,7 @@ class LidarInertialOdometry(Snapshots):
         timing_s: Mapping[str, float] | None = None,
     ) -> Estimate:
         """What is said of a scan; without an outcome it is the first one, which is exact by definition."""
-        warnings = self._warnings
-        self._warnings = []
+        warnings, self._warnings = self._warnings, []
         if not frame.covered:
             warnings.append("no IMU sample at or after the end of the scan: the last one was held")
         if self._is_blind(frame):
