@@ -222,7 +222,9 @@ class _SE2(KernelManifold):
 
     def check(self, name: str, x: ArrayLike) -> NDArray[np.float64]:
         rows = super().check(name, x)
-        rows[:, 0] = np.arctan2(np.sin(rows[:, 0]), np.cos(rows[:, 0]))
+        around = np.abs(rows[:, 0]) > np.pi
+        if around.any():
+            rows[around, 0] = np.arctan2(np.sin(rows[around, 0]), np.cos(rows[around, 0]))
         return rows
 
     def identity(self) -> NDArray[np.float64]:

@@ -29,6 +29,7 @@ from boxplus.optimization.terms.jacobian_notes import jacobian_notes
 from boxplus.optimization.terms.layout import Layout
 from boxplus.optimization.terms.removal import Masks, keep_first_estimates, require_forgettable, take_out, touching
 from boxplus.optimization.terms.variables import VariableRows, Variables
+from boxplus.optimization.terms.weighting import checked_weights
 from boxplus.residuals.marginal_prior import MarginalPrior
 from boxplus.residuals.residual import Residual
 from boxplus.sparse.cholesky import Analysis, NotPositiveDefinite
@@ -258,16 +259,9 @@ class Problem:
             InputError: a group of another problem, weights of another shape, negative or not finite.
         """
         self._number_of(group)
-        if weights is None:
-            group.set_weights(None)
-            none = np.zeros(group.residual.count, dtype=np.bool_)
-        else:
-            checked = np.asarray(weights, dtype=np.float64)
-            if checked.shape != (group.residual.count,) or not (np.isfinite(checked) & (checked >= 0.0)).all():
-                expected = f"weights ({group.residual.count},), finite and not negative"
-                raise InputError(expected, f"shape {checked.shape}, smallest {checked.min(initial=np.inf):g}", "repair them")
-            group.set_weights(checked)
-            none = checked == 0.0
+        checked = None if weights is None else checked_weights(weights, group.residual.count)
+        group.set_weights(checked)
+        none = np.zeros(group.residual.count, dtype=np.bool_) if checked is None else checked == 0.0
         before = group.left_out if group.left_out is not None else np.zeros_like(none)
         fresh, counted = int(np.count_nonzero(none & ~before)), int(np.count_nonzero(~before))
         if (before & ~none).any() or fresh > _STALE * counted:
@@ -315,6 +309,11 @@ class Problem:
     def defects(self) -> list[str]:
         """What is wrong with the structure, a sentence each: variables without residuals, components without gauge."""
         return structural_defects(self.blocks, [*self.groups, *held_groups(self.blocks)])
+
+    @changes
+    def analysis(self, options: SolverOptions) -> Analysis | None:
+        """The symbolic factorisation that the next `solve` with these options takes; None where none is sparse."""
+        return self._analyse(options)[0].system.analysis
 
     @changes
     def solve(

@@ -5,12 +5,26 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
+from boxplus.errors import InputError
 from boxplus.optimization.losses import SQUARED, USER, triggs, triggs_factors
 
 _SIX = np.uint64(6)
+
+
+def checked_weights(weights: ArrayLike, count: int) -> NDArray[np.float64]:
+    """Weights (count,) of residuals, one each.
+
+    Raises:
+        InputError: another shape, negative or not finite ones.
+    """
+    checked = np.asarray(weights, dtype=np.float64)
+    if checked.shape != (count,) or not (np.isfinite(checked) & (checked >= 0.0)).all():
+        got = f"shape {checked.shape}, smallest {checked.min(initial=np.inf):g}"
+        raise InputError(f"weights ({count},), finite and not negative", got, "repair them")
+    return checked
 
 
 @kernel

@@ -204,25 +204,27 @@ def structure_notes(graph: PoseGraph, held: NDArray[np.int64]) -> list[str]:
 
 def repetition_notes(graph: PoseGraph) -> list[str]:
     """A sentence on edges that are there twice, measurement and all, the other way round too."""
-    group = se3 if graph.dimension == 3 else se2
-    is_back = graph.edges[:, 0] > graph.edges[:, 1]
-    Z = graph.measurements.copy()
-    Z[is_back] = group.inverse(Z[is_back])
+    i, j = graph.edges.T
+    all_keys = np.minimum(i, j) * len(graph.ids) + np.maximum(i, j)
+    ascending = np.sort(all_keys)
+    parallel = np.flatnonzero(np.isin(all_keys, ascending[1:][ascending[1:] == ascending[:-1]]))
+    if not len(parallel):
+        return []
+    key, is_back, Z = all_keys[parallel], i[parallel] > j[parallel], graph.measurements[parallel]
+    Z[is_back] = (se3 if graph.dimension == 3 else se2).inverse(Z[is_back])
     if graph.dimension == 3:
         Z[:, :4] *= np.where(Z[:, :1] < 0.0, -1.0, 1.0)  # q and -q turn alike
-    low, high = np.sort(graph.edges, axis=1).T
-    key = low * len(graph.ids) + high
     # Inverting and printing round, and rounding must not part what is next to each other.
     order = np.lexsort((np.arange(len(key)), np.round(Z[:, -1], _DIGITS), key))
     same = key[order][1:] == key[order][:-1]
     same &= (np.abs(Z[order][1:] - Z[order][:-1]) <= _ROUNDED * (1.0 + np.abs(Z[order][1:]))).all(axis=1)
-    repeated = np.sort(order[1:][same])
+    repeated = np.sort(parallel[order[1:][same]])
     if not len(repeated):
         return []
     turned = np.count_nonzero(is_back[order][1:][same] != is_back[order][:-1][same])
     there, count_again = ("is", "counts") if len(repeated) == 1 else ("are", "count")
     return [
-        f"{len(repeated)} of {len(order)} edges {there} there before with the same measurement"
+        f"{len(repeated)} of {len(graph.edges)} edges {there} there before with the same measurement"
         + (f" ({turned} of them the other way round)" if turned else "")
         + f" and {count_again} again, as if measured independently; standard deviations come out too small: "
         + edge_names(graph, repeated)

@@ -180,7 +180,8 @@ def optimize_pose_graph(
     whole, graph = graph, with_edges(graph, ~silent)
     held = held_poses(graph)
     problem, poses = pose_graph_problem(graph, held=held, loss=loss, objective=config.objective)
-    starts = Starts(graph, held, config.start, options, callback)
+    follow = consecutive_edges(graph)
+    starts = Starts(graph, problem, follow, held, config.start, options, callback)
     built = time.perf_counter()
     known = starts.candidates(loss, is_robust=config.robust == "gnc")
     costs = {name: convex_cost(problem, [start]) for name, start in known.items()}
@@ -202,7 +203,7 @@ def optimize_pose_graph(
         is_loud = config.objective == "logarithm" and turns(residual, graph, solution.values[0]) > _LOUD
         if loss is None and config.start == "auto" and (first.is_doubtful or is_loud):
             enough = first.enough if first.is_doubtful else None
-            chosen, solution = starts.further(problem, chosen, solution, known, minima, enough, is_loud=is_loud)
+            chosen, solution = starts.further(chosen, solution, known, minima, enough, is_loud=is_loud)
             squared = squared_errors(residual, graph, solution.values[0])
         weights = np.ones(len(squared)) if loss is None else problem.groups[0].loss_weights(solution.values)
     solved = time.perf_counter()
@@ -218,7 +219,7 @@ def optimize_pose_graph(
         notes.append(slack_sentence(fit))
     notes += local_notes(fit, minima)
     drifted = drifted_doubt(graph, poses_end) if free else None
-    reasons = [text for text in (solution.unconverged(), misreading(graph), drifted) if text]
+    reasons = [text for text in (solution.unconverged(), misreading(graph, follow), drifted) if text]
     if verdict is not None:
         if fit.is_poor and not fit.is_contradiction:
             notes.append(f"{misfit(fit)}: information that is too optimistic, or false loop closures among those that were kept")
@@ -226,7 +227,7 @@ def optimize_pose_graph(
         notes += unsure
         reasons += _verdict_doubts(fit, verdict) + against
     else:
-        joints = lone_joints(graph)
+        joints = lone_joints(graph, follow)
         reasons += [one.sentence for one in joints if one.is_grave]
         notes += [one.sentence for one in joints if not one.is_grave]
     if verdict is None and loss is not None and starts.verdict is not None:
@@ -248,7 +249,7 @@ def optimize_pose_graph(
             kept = np.ones(len(graph.edges), dtype=np.bool_) if verdict is None else verdict.is_kept
             reliability = Reliability.of(with_edges(graph, kept), solution, poses)
             if reliability is not None:
-                found = suspicions(reliability, solution, poses, consecutive_edges(graph)[kept])
+                found = suspicions(reliability, solution, poses, follow[kept])
     is_at_end = solution.status == "converged" or solution.limit == "steps"  # a small χ² is none of a start
     if config.examine and verdict is None and loss is None and config.objective == "logarithm" and is_at_end:
         meant = information_doubt(graph, solution, poses, held, options, reliability, callback)

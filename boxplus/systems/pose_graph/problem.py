@@ -87,9 +87,7 @@ def consecutive_edges(graph: PoseGraph) -> NDArray[np.bool_]:
 
     None where less than half of the poses are joined to the next: the edges that are then were drawn as any others.
     """
-    i, j = odometry_order(graph)[graph.edges].T
-    follow = np.asarray(np.abs(i - j) == 1)
-    known = len(np.unique(np.minimum(i, j)[follow]))
+    follow, known = _following(graph, odometry_order(graph))
     return follow if 2 * known >= len(graph.ids) - 1 else np.zeros(len(follow), dtype=np.bool_)
 
 
@@ -97,11 +95,18 @@ def odometry_order(graph: PoseGraph) -> NDArray[np.int64]:
     """(n,) place of every pose in the order of names or in that of the file, whichever joins more poses to the next."""
     by_name, by_file = np.empty(len(graph.ids), dtype=np.int64), np.arange(len(graph.ids))
     by_name[np.argsort(graph.ids, kind="stable")] = by_file
-    joined = []
-    for rank in (by_name, by_file):
-        i, j = rank[graph.edges].T
-        joined.append(len(np.unique(np.minimum(i, j)[np.abs(i - j) == 1])))
-    return by_file if joined[1] > joined[0] else by_name
+    if np.array_equal(by_name, by_file):
+        return by_name
+    return by_file if _following(graph, by_file)[1] > _following(graph, by_name)[1] else by_name
+
+
+def _following(graph: PoseGraph, rank: NDArray[np.int64]) -> tuple[NDArray[np.bool_], int]:
+    """(m,) edges between poses that follow each other in the order of rank (n,), and how many poses are so joined to the next."""
+    i, j = rank[graph.edges].T
+    follow = np.asarray(np.abs(i - j) == 1)
+    is_joined = np.zeros(len(rank), dtype=np.bool_)
+    is_joined[np.minimum(i, j)[follow]] = True
+    return follow, int(np.count_nonzero(is_joined))
 
 
 def squared_errors(residual: Residual, graph: PoseGraph, poses: NDArray[np.float64]) -> NDArray[np.float64]:

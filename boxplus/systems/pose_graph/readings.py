@@ -7,22 +7,24 @@ from numpy.typing import NDArray
 
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import quaternion
-from boxplus.systems.pose_graph.problem import consecutive_edges
 
 _FAR, _NEAR = 0.2, 0.02  # of a step's length, by which poses and edges contradict each other as read, and agree otherwise
 _LEAST = 10  # steps
 _LIMIT = 20_000  # steps looked at
 
 
-def misreading(graph: PoseGraph) -> str | None:
+def misreading(graph: PoseGraph, follow: NDArray[np.bool_]) -> str | None:
     """A sentence where the poses of the file contradict its odometry as they were read, and agree with it read in another way.
 
     The ways are angles in degrees (2D), quaternions with w first (3D), edges that go from the second pose to the first, poses of
     the world in the body, a world that is mirrored, and positions in another unit than the edges.
+
+    Args:
+        follow: (m,) which edges are odometry (`consecutive_edges`).
     """
     if graph.poses is None:
         return None
-    steps = np.flatnonzero(consecutive_edges(graph))
+    steps = np.flatnonzero(follow)
     steps = steps[:: max(1, len(steps) // _LIMIT)]
     i, j = graph.edges[steps].T
     split = 4 if graph.dimension == 3 else 1

@@ -17,6 +17,7 @@ from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import quaternion
 from boxplus.manifolds.se3 import compose_into, inverse_into
 from boxplus.sparse.block_matrix import BlockPattern
+from boxplus.sparse.breadth_first import breadth_first_trees
 from boxplus.sparse.cholesky import SparseCholesky
 from boxplus.sparse.components import connected_components
 
@@ -40,53 +41,39 @@ def spanning_tree_start(graph: PoseGraph) -> NDArray[np.float64]:
     """Poses, laid out as the measurements, composed along breadth-first trees from the first held pose of every component.
 
     Held poses stay where the graph has them, or are the identity. With breadth first, the chains of measurements that
-    errors pile up along are as short as can be.
+    errors pile up along are as short as can be. Of parallel edges the last one stands.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import breadth_first_order
-
-    n, (i, j) = len(graph.ids), graph.edges.T
-    # Of parallel edges the last one stands; + 1 because a zero would be no edge.
-    number = np.arange(1, len(i) + 1, dtype=np.float64)
-    key, last = np.unique((np.minimum(i, j) * n + np.maximum(i, j))[::-1], return_index=True)
-    chosen = len(i) - 1 - last
-    links = coo_array((number[chosen], (key // n, key % n)), shape=(n, n)).tocsr()
-    links = (links + links.T).tocsr()
     held = held_poses(graph)
     poses = _at_held(graph, held)
-    roots = held[np.unique(components(graph)[held], return_index=True)[1]]
-    for root in roots:
-        order, parent = breadth_first_order(links, int(root), directed=False, return_predecessors=True)
-        children = order[1:].astype(np.int64)
-        children = children[~np.isin(children, held)]
-        if not len(children):
-            continue
-        parents = parent[children].astype(np.int64)
-        edge = np.asarray(links[children, parents]).reshape(-1).astype(np.int64) - 1
-        forward = i[edge] == parents
-        if graph.dimension == 3:
-            _follow_3d(children, parents, edge, forward, graph.measurements, poses)
-        else:
-            _follow_2d(children, parents, edge, forward, graph.measurements, poses)
+    is_held = np.zeros(len(graph.ids), dtype=np.bool_)
+    is_held[held] = True
+    child, parent, edge = breadth_first_trees(graph.edges, is_held)
+    forward = graph.edges[edge, 0] == parent
+    follow = _follow_3d if graph.dimension == 3 else _follow_2d
+    follow(child, parent, edge, forward, graph.measurements, poses)
     return poses
 
 
-def chordal_start(graph: PoseGraph) -> NDArray[np.float64]:
+def chordal_start(graph: PoseGraph, order: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
     """Poses, laid out as the measurements, from the chordal relaxation.
 
     Held poses stay where the graph has them, or are the identity. An edge weighs by the precision of its rotation and of
     its translation, each averaged over the axes.
+
+    Args:
+        order: (n − held,) in which a factorisation eliminates the poses that are not held, numbered from 0, where one is known:
+            the graph is the same for every objective.
     """
-    i, j = graph.edges.T
+    i = graph.edges[:, 0]
     roots = held_poses(graph)
     start = _at_held(graph, roots)
     kappa, tau = _weights(graph)
-    relaxation = _Relaxation(len(graph.ids), i, j, roots)
+    relaxation = _Relaxation(len(graph.ids), graph.edges, roots, order)
     if graph.dimension == 3:
         Z = quaternion.to_matrix(graph.measurements[:, :4])
         # A row of R, as a column u: u_j = Zᵀ u_i. The three rows are three right-hand sides.
         known = np.swapaxes(quaternion.to_matrix(start[roots, :4]), 1, 2)
-        rows = relaxation.minimum(np.swapaxes(Z, 1, 2), None, kappa, known)
+        rows = relaxation.minimum(np.swapaxes(Z, 1, 2), np.zeros((len(Z), 3, 3)), kappa, known)
         R = _nearest_rotations(np.swapaxes(rows, 1, 2))
         start[:, :4] = quaternion.from_matrix(R)
         measured, at = graph.measurements[:, 4:], slice(4, 7)
@@ -94,7 +81,7 @@ def chordal_start(graph: PoseGraph) -> NDArray[np.float64]:
         c, s = np.cos(graph.measurements[:, 0]), np.sin(graph.measurements[:, 0])
         Z = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
         known = np.stack([np.cos(start[roots, 0]), np.sin(start[roots, 0])], -1)[:, :, None]
-        u = relaxation.minimum(Z, None, kappa, known)[:, :, 0]
+        u = relaxation.minimum(Z, np.zeros((len(Z), 2, 1)), kappa, known)[:, :, 0]
         start[:, 0] = np.arctan2(u[:, 1], u[:, 0])
         c, s = np.cos(start[:, 0]), np.sin(start[:, 0])
         R = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
@@ -130,26 +117,27 @@ class _Relaxation:
 
     Args:
         n: poses.
-        i, j: (m,) ends of the edges.
+        edges: (m, 2) ends i and j.
         roots: (k,) poses where u is known.
+        order: of the other poses, numbered from 0, in a factorisation; None where none is known yet.
     """
 
-    def __init__(self, n: int, i: NDArray[np.int64], j: NDArray[np.int64], roots: NDArray[np.int64]) -> None:
-        self._i, self._j, self._roots = i, j, roots
-        self._free = np.ones(n, dtype=np.bool_)
-        self._free[roots] = False
-        self._between = self._free[i] & self._free[j]
-        self._inner = np.flatnonzero(self._between)
-        number = np.cumsum(self._free) - 1
-        self._pattern, self._pairs = BlockPattern.from_pairs(
-            np.ones(int(self._free.sum()), dtype=np.int64), number[j[self._inner]], number[i[self._inner]]
-        )
-        self._order: NDArray[np.int64] | None = None
+    def __init__(self, n: int, edges: NDArray[np.int64], roots: NDArray[np.int64], order: NDArray[np.int64] | None) -> None:
+        self._edges, self._roots, self._order = edges, roots, order
+        free = np.ones(n, dtype=np.bool_)
+        free[roots] = False
+        self._free = np.flatnonzero(free)
+        self._number = np.where(free, np.cumsum(free) - 1, -1)
+        ends = self._number[edges]
+        inner = np.flatnonzero((ends >= 0).all(axis=1))
+        self._pattern, pairs = BlockPattern.from_pairs(np.ones(len(self._free), dtype=np.int64), *ends[inner].T)
+        self._block = np.full(len(edges), -1)
+        self._block[inner] = pairs.block
 
     def minimum(
         self,
         M: NDArray[np.float64],
-        step: NDArray[np.float64] | None,
+        step: NDArray[np.float64],
         weight: NDArray[np.float64],
         known: NDArray[np.float64],
     ) -> NDArray[np.float64]:
@@ -157,35 +145,65 @@ class _Relaxation:
 
         Args:
             M: (m, d, d), orthogonal.
-            step: (m, d, c); None where all are zero.
+            step: (m, d, c).
             weight: (m,).
         """
-        i, j, n, size = self._i, self._j, len(self._free), len(self._pattern.sizes)
-        d, c = known.shape[1:]
-        u = np.zeros((n, d, c))
+        size, (d, c) = len(self._free), known.shape[1:]
+        u = np.zeros((len(self._number), d, c))
         u[self._roots] = known
         if size == 0:
             return u
-        told = np.flatnonzero(~self._between) if step is None else np.arange(len(i))
-        pull = M[told] @ u[i[told]] - u[j[told]]  # the free ones are still zero
-        if step is not None:
-            pull += step
-        pull *= weight[told, None, None]
-        right = np.zeros((n, d, c))
-        np.add.at(right, j[told], pull)
-        np.add.at(right, i[told], -np.swapaxes(M[told], 1, 2) @ pull)
         pattern = BlockPattern(np.full(size, d), self._pattern.col_start, self._pattern.row)
-        values = np.zeros(len(pattern.row) * d * d).reshape(-1, d, d)
-        coupling = -weight[self._inner, None, None] * M[self._inner]
-        turned = np.where(self._pairs.transposed[:, None, None], np.swapaxes(coupling, 1, 2), coupling)
-        np.add.at(values, self._pairs.block, turned)
-        degree = np.bincount(i, weight, n) + np.bincount(j, weight, n)
-        values[pattern.col_start[:-1]] += degree[self._free, None, None] * np.eye(d)
+        values, right = np.zeros((len(pattern.row), d, d)), np.zeros((size, d, c))
+        _assemble(
+            self._edges, self._number, self._block, pattern.col_start, np.ascontiguousarray(M), step, weight, u, values, right
+        )
         cholesky = SparseCholesky(pattern, ordering="auto" if self._order is None else self._order)
         self._order = cholesky.permutation
         cholesky.factorize(values.reshape(-1))
-        u[self._free] = cholesky.solve(right[self._free].reshape(size * d, c)).reshape(size, d, c)
+        u[self._free] = cholesky.solve(right.reshape(size * d, c)).reshape(size, d, c)
         return u
+
+
+@kernel
+def _assemble(
+    edges: NDArray[np.int64],
+    number: NDArray[np.int64],
+    block: NDArray[np.int64],
+    diagonal: NDArray[np.int64],
+    M: NDArray[np.float64],
+    step: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    u: NDArray[np.float64],
+    values: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> None:
+    """Add the normal equations of `_Relaxation` to values (blocks, d, d) and right (free poses, d, c).
+
+    `number` is −1 where u is known, and u zero elsewhere; `block` that of an edge between
+    free poses, `diagonal` that of a pose.
+    """
+    d, c = u.shape[1], u.shape[2]
+    for e in range(edges.shape[0]):
+        i, j, w = edges[e, 0], edges[e, 1], weight[e]
+        a, b = number[i], number[j]
+        for p in range(d):
+            if a >= 0:
+                values[diagonal[a], p, p] += w
+            if b >= 0:
+                values[diagonal[b], p, p] += w
+            for q in range(d):
+                if a >= 0 and b >= 0:
+                    values[block[e], p, q] -= w * (M[e, p, q] if b > a else M[e, q, p])
+            for k in range(c):
+                pull = step[e, p, k] - u[j, p, k]
+                for q in range(d):
+                    pull += M[e, p, q] * u[i, q, k]
+                if b >= 0:
+                    right[b, p, k] += w * pull
+                if a >= 0:
+                    for q in range(d):
+                        right[a, q, k] -= w * M[e, p, q] * pull
 
 
 def _nearest_rotations(M: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.pose_graph.bridges import Bridge, bridge_pieces
 from boxplus.systems.pose_graph.loops import LoopVerdict, judge_loops
 from boxplus.systems.pose_graph.named import named
-from boxplus.systems.pose_graph.problem import consecutive_edges, pose_graph_problem, with_edges
+from boxplus.systems.pose_graph.problem import pose_graph_problem, with_edges
 from boxplus.systems.pose_graph.start import chordal_start, components, spanning_tree_start
 
 Start = Literal["file", "spanning_tree", "chordal", "chordal_objective", "graduated", "cauchy"]
@@ -37,17 +37,27 @@ class Starts:
     """
 
     def __init__(
-        self, graph: PoseGraph, held: NDArray[np.int64], wanted: Wanted, options: SolverOptions, callback: Callback | None
+        self,
+        graph: PoseGraph,
+        problem: Problem,
+        follow: NDArray[np.bool_],
+        held: NDArray[np.int64],
+        wanted: Wanted,
+        options: SolverOptions,
+        callback: Callback | None,
     ) -> None:
+        """`problem` is that of the graph, and `follow` (m,) which of its edges are odometry (`consecutive_edges`)."""
         if wanted == "file" and graph.poses is None:
             raise InputError(
                 "poses in the file to start from", f"only edges ({graph.source})", "start with `chordal` or `spanning_tree`"
             )
-        self.is_loop = ~consecutive_edges(graph)
-        self._graph, self._held, self._wanted, self._options, self._callback = graph, held, wanted, options, callback
+        self.is_loop = ~follow
+        self._graph, self._problem, self._held, self._wanted = graph, problem, held, wanted
+        self._options, self._callback = options, callback
         self.bridges: list[Bridge] = []
         self.verdict: LoopVerdict | None = None
         self._stopped = False
+        self._chordal: NDArray[np.float64] | None = None
 
     def candidates(self, loss: Loss | None, *, is_robust: bool) -> dict[Start, NDArray[np.float64]]:
         """Poses of every start that is compared.
@@ -67,7 +77,7 @@ class Starts:
             if wanted in ("auto", "file") and graph.poses is not None:
                 found["file"] = graph.poses
             if wanted in ("auto", "chordal"):
-                found["chordal"] = chordal_start(graph)
+                found["chordal"] = self._chordal_start()
             if wanted == "spanning_tree":
                 found["spanning_tree"] = spanning_tree_start(graph)
         if forgets and self.is_loop.any():
@@ -77,7 +87,6 @@ class Starts:
 
     def further(
         self,
-        problem: Problem,
         first: Start,
         solution: Solution,
         known: dict[Start, NDArray[np.float64]],
@@ -111,16 +120,15 @@ class Starts:
                 except InputError:
                     continue  # the chordal objective has no weights for edges that say nothing along some axis
             watch = named(self._watch, f"from another start, {name.replace('_', ' ')}")
-            tried = problem.solve(self._options, start=[known[name]], callback=watch)
+            tried = self._problem.solve(self._options, start=[known[name]], callback=watch)
             minima[name] = 2.0 * tried.cost
             if tried.cost < best[1].cost:
                 best = (name, tried)
         # Also where `enough` was reached: of 8 walks of 0.35 and 0.4 rad of noise that had got there, 3 fell by 3 to 10 % more.
-        return self._relaxed(problem, *best, known, minima) if is_loud else best
+        return self._relaxed(*best, known, minima) if is_loud else best
 
     def _relaxed(
         self,
-        problem: Problem,
         name: Start,
         solution: Solution,
         known: dict[Start, NDArray[np.float64]],
@@ -137,7 +145,7 @@ class Starts:
             if self._stopped:
                 break
             left = forgetting.solve(self._options, start=[solution.values[0]], callback=watch).values[0]
-            tried = problem.solve(self._options, start=[left], callback=watch)
+            tried = self._problem.solve(self._options, start=[left], callback=watch)
             if not tried.cost < (1.0 - _FALLS) * solution.cost:
                 break
             name, solution = "cauchy", tried
@@ -152,8 +160,15 @@ class Starts:
             # Smooth where the logarithm jumps at half a turn, and with far fewer minima.
             smooth, _ = pose_graph_problem(self._graph, held=self._held, loss=None, objective="chordal")
             watch = named(self._watch, "finding another start by the chordal objective")
-            return smooth.solve(self._options, start=[chordal_start(self._graph)], callback=watch).values[0]
-        return chordal_start(self._graph) if name == "chordal" else spanning_tree_start(self._graph)
+            return smooth.solve(self._options, start=[self._chordal_start()], callback=watch).values[0]
+        return self._chordal_start() if name == "chordal" else spanning_tree_start(self._graph)
+
+    def _chordal_start(self) -> NDArray[np.float64]:
+        """Made once, in the order of elimination that the problem itself is going to be solved in."""
+        if self._chordal is None:
+            analysis = self._problem.analysis(self._options)
+            self._chordal = chordal_start(self._graph, None if analysis is None else analysis.fronts.order)
+        return self._chordal
 
     def _bridge(self) -> None:
         if not self.is_loop.all():

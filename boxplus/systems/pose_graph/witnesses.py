@@ -17,6 +17,7 @@ from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.solver_options import SolverOptions
+from boxplus.sparse.components import connected_components
 from boxplus.sparse.cut_edges import cut_edges
 from boxplus.systems.pose_graph.doubts import Fit, edge_names, misfit, standing_out
 from boxplus.systems.pose_graph.problem import (
@@ -88,13 +89,16 @@ def _pulled(known: Reliability, poses: NDArray[np.float64], graph: PoseGraph, do
     return [Suspicion(told, True)]
 
 
-def lone_joints(graph: PoseGraph) -> list[Suspicion]:
+def lone_joints(graph: PoseGraph, follow: NDArray[np.bool_]) -> list[Suspicion]:
     """Stretches of odometry that are joined by a single loop closure, which nothing checks.
 
     Closures between the same two poses are one witness; poses that the file fixes are joined by that.
+
+    Args:
+        follow: (m,) which edges are odometry (`consecutive_edges`).
     """
-    is_loop = ~consecutive_edges(graph)
-    label = components(with_edges(graph, ~is_loop))
+    is_loop = ~follow
+    label = connected_components(len(graph.ids), *graph.edges[follow].T)[1]
     sizes = np.bincount(label, minlength=1)
     if is_loop.all() or len(sizes) < 2:
         return []

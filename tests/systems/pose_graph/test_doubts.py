@@ -11,6 +11,7 @@ import pytest
 from boxplus import InputError, PoseGraphConfig, optimize_pose_graph
 from boxplus.manifolds import se2, se3
 from boxplus.simulation.pose_graphs import simulate_pose_graph
+from boxplus.systems.pose_graph.problem import consecutive_edges
 from boxplus.systems.pose_graph.readings import misreading
 
 STARTS = ("auto", "file", "chordal", "spanning_tree")
@@ -158,11 +159,11 @@ def test_a_file_that_means_something_else_than_it_was_read_as_is_told():
     for graph, cause in cases:
         assert cause in optimize_pose_graph(graph).doubt
     for graph in (plane, space):
-        assert misreading(graph) is None
+        assert misreading(graph, consecutive_edges(graph)) is None
         rng = np.random.default_rng(0)
         start = graph.poses + 3.0 * rng.standard_normal(graph.poses.shape) * (np.arange(graph.poses.shape[1]) >= graph.dimension)
         start[:, :4] /= np.linalg.norm(start[:, :4], axis=1, keepdims=True) if graph.dimension == 3 else 1.0
-        assert misreading(replace(graph, poses=start)) is None  # a bad start is none
+        assert misreading(replace(graph, poses=start), consecutive_edges(graph)) is None  # a bad start is none
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

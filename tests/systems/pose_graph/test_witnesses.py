@@ -117,12 +117,13 @@ def test_lone_joints_are_found_in_any_number_of_pieces():
     edges = np.concatenate([inside, twice[np.tile(middle == 0, 2)], [[first[pieces // 2] - 2, first[pieces // 2] + 1]]])
     count = len(edges)
     graph = PoseGraph(2, ids, None, edges, np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1)), np.zeros(0, dtype=np.int64))
-    (found,) = lone_joints(graph)
+    (found,) = lone_joints(graph, consecutive_edges(graph))
     assert found.is_grave and found.sentence.startswith("2000 poses hang on the loop closure 4992 → 5001 alone")
     rows = np.r_[: len(inside) + pieces - 2, count - 1]  # every one of them joined once
-    (_, *rest) = lone_joints(with_edges(graph, np.isin(np.arange(count), rows)))
+    once = with_edges(graph, np.isin(np.arange(count), rows))
+    (_, *rest) = lone_joints(once, consecutive_edges(once))
     assert len(rest) == 5 and rest[-1].sentence.startswith("994 more stretches of odometry hang on one loop closure each")
-    assert not lone_joints(replace(graph, fixed=np.array([0, len(ids) - 1])))
+    assert not lone_joints(replace(graph, fixed=np.array([0, len(ids) - 1])), consecutive_edges(graph))
 
 
 def test_a_narrow_loss_of_sound_edges_is_not_said_to_silence_them():
