@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-import numpy as np
-import yaml
 from pydantic import Field, field_validator, model_validator
 
 from boxplus._settings import Settings
@@ -60,6 +58,8 @@ class OtherLidar(Settings):
             return value
         if not value.lstrip().startswith("{"):
             return {"topic": value}
+        import yaml  # here, as is numpy below: a command's --help, which lists these fields, needs neither
+
         try:
             return yaml.safe_load(value)
         except yaml.YAMLError as error:
@@ -70,10 +70,12 @@ class OtherLidar(Settings):
     @field_validator("T_lidar_other")
     @classmethod
     def _rigid(cls, value: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
-        from boxplus.filtering.nav_state import check_transform  # here, as commands that read no recording start faster without
-
         if value is None:
             return None
+        import numpy as np
+
+        from boxplus.filtering.nav_state import check_transform  # here, as commands that read no recording start faster without
+
         return tuple(tuple(float(x) for x in row) for row in check_transform("T_lidar_other", np.array(value)))
 
 

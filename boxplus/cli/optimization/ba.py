@@ -12,7 +12,7 @@ import typer
 
 from boxplus._words import counted
 from boxplus.cli import uncollected
-from boxplus.cli.optimization.terminal import (
+from boxplus.cli.optimization.options import (
     LinearSolverChoice,
     LinearSolverOption,
     LossOption,
@@ -20,6 +20,8 @@ from boxplus.cli.optimization.terminal import (
     MethodOption,
     OutputOption,
     TimeLimitOption,
+    parse_loss,
+    solver_options,
 )
 from boxplus.cli.options import JsonOption, NoReportOption, OverwriteOption, QuietOption, ThreadsOption
 from boxplus.cli.viewing import ViewOption, viewing
@@ -97,7 +99,7 @@ def ba(
     with uncollected():
         from boxplus.cli.interrupt import stop_on_interrupt
         from boxplus.cli.optimization.ba_lines import adjust_line_set, is_line_set
-        from boxplus.cli.optimization.terminal import OptimizationTerminal, parse_loss, solver_options
+        from boxplus.cli.optimization.terminal import OptimizationTerminal
         from boxplus.cli.outcome import reported
         from boxplus.errors import InputError
         from boxplus.formats.reconstructions.reconstruction import (

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from boxplus.cli.optimization.terminal import MethodChoice, OptimizationTerminal
+    from boxplus.cli.optimization.options import MethodChoice
+    from boxplus.cli.optimization.terminal import OptimizationTerminal
     from boxplus.cli.outcome import Outcome
     from boxplus.formats.reconstructions.vgg_lines import VggLines
     from boxplus.optimization.losses import Loss

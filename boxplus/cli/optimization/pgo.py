@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from boxplus.cli import uncollected
-from boxplus.cli.optimization.terminal import (
+from boxplus.cli.optimization.options import (
     LinearSolverChoice,
     LinearSolverOption,
     LossOption,
@@ -20,6 +20,8 @@ from boxplus.cli.optimization.terminal import (
     MethodOption,
     OutputOption,
     TimeLimitOption,
+    parse_loss,
+    solver_options,
 )
 from boxplus.cli.options import JsonOption, NoReportOption, OverwriteOption, QuietOption, ThreadsOption
 from boxplus.cli.own_words import POSE_GRAPH, saying
@@ -131,7 +133,7 @@ def pgo(
     """
     with uncollected():
         from boxplus.cli.interrupt import stop_on_interrupt
-        from boxplus.cli.optimization.terminal import OptimizationTerminal, parse_loss, solver_options
+        from boxplus.cli.optimization.terminal import OptimizationTerminal
         from boxplus.cli.outcome import reported
         from boxplus.formats.graphs.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
         from boxplus.runs.storage.output_folder import output_folder

@@ -22,6 +22,7 @@ from boxplus.sparse.product_tiles import add_sums, tile_of
 
 # Pieces for every thread, so that one with more work does not hold up the others; more cost more calls than they even out.
 _PIECES = 4
+_WORTH_THREADS = 500_000  # multiplications; to wake a thread for fewer takes as long as it saves
 _MANY, _AT_ONCE = 4, 256  # variables of a residual, and of all of a group, whose products are not worth a call each
 
 
@@ -138,6 +139,8 @@ def add_products(gather: Gather, values: NDArray[np.float64], threads: int) -> N
     """values[place:] += Σ Jₐᵀ J_b, row-major, for every place of `gather`."""
     Ja, Jb = gather.group.jacobians[gather.a], gather.group.jacobians[gather.b]
     tile = tile_of(Ja.shape[1], Ja.shape[2], Jb.shape[2])
+    if len(gather.residual) * Ja.shape[1] * Ja.shape[2] * Jb.shape[2] < _WORTH_THREADS:
+        threads = 1
 
     def work(_: int, first: int, last: int) -> None:
         add_sums(tile, 1.0, first, last, gather.target, gather.begin, gather.residual, gather.residual, Ja, Jb, values)
@@ -149,6 +152,8 @@ def add_gradient(gather: Gather, gradient: NDArray[np.float64], threads: int) ->
     """gradient[place:] += Σ Jₐᵀ r for every place of `gather`."""
     group = gather.group
     J = group.jacobians[gather.a]
+    if len(gather.residual) * J.shape[1] * J.shape[2] < _WORTH_THREADS:
+        threads = 1
 
     def work(_: int, first: int, last: int) -> None:
         _accumulate_gradient(first, last, gather.target, gather.begin, gather.residual, J, group.r, gradient)

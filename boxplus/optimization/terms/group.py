@@ -26,6 +26,7 @@ from boxplus.residuals.residual import Residual
 
 # Residuals linearised, whitened and weighted in one go: few enough to stay in the second-level cache.
 _CHUNK = 1024
+_WORTH_THREADS = 200_000  # numbers in the Jacobians of a group; to wake a thread for fewer takes as long as it saves
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +103,7 @@ class Group:
         self.left_out: NDArray[np.bool_] | None = None
         self._root: NDArray[np.float64] | None = None
         self._chunk = max(residual.count, 1) if residual.count <= 2 * _CHUNK else _CHUNK
+        self._is_large = residual.count * residual.dim * self.tangents >= _WORTH_THREADS
         self._sums = np.zeros((-(-residual.count // self._chunk), 4))
 
     def __getitem__(self, rows: ArrayLike | slice) -> ResidualRows:
@@ -318,7 +320,7 @@ class Group:
                     weigh_jacobian(begin, end, self.r, self._factor, self._projection, J)
 
         if within is None:
-            run_chunks(work, residual.count, self._chunk, threads)
+            run_chunks(work, residual.count, self._chunk, threads if self._is_large else 1)
         else:
             work(0, *within)
         cost, common, lost, valid = (self._sums[0] if len(self._sums) == 1 else self._sums.sum(axis=0)).tolist()

@@ -58,8 +58,9 @@ from boxplus.systems.pose_graph.start import held_poses
 from boxplus.systems.pose_graph.starts import Start, Starts, Wanted
 from boxplus.systems.pose_graph.witnesses import held_against_each_other, lone_joints
 
-# Almost Gauss-Newton: long chains are so badly conditioned that more damping than this costs iterations.
-_DAMPING = 1e-9
+# Almost Gauss-Newton: long chains are so badly conditioned that more damping than this costs iterations. Less would soon be below
+# what a pivot is told from rounding by, and have to grow again where edges leave something free.
+_DAMPING = 1e-11
 _LOUD = 0.2  # [rad] root mean square of the errors in rotation from which on local minima fit their information, too
 _COUNTS = 0.5  # weight from which on an edge is expected to fit its information
 
