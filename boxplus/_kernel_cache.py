@@ -31,17 +31,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numba
 from numba.core import environment
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, _CacheLocator
 
 from boxplus._machine_code import rebuild_function, reduce_function, start_runtime
+from boxplus._source_keys import resolved, source_key
 
 _log = logging.getLogger(__name__)
-_PACKAGE_ROOT = Path(__file__).resolve().parent
-_IMPORT = re.compile(
-    r"^\s*(?:from\s+((?:boxplus|\.)[\w.]*)\s+import\s+(\([^)]*\)|[^\n]*)|import\s+(boxplus[\w.]+))", re.MULTILINE
-)
 _DIGEST_BYTES = 32
 _WRITABLE_FOR_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _OF_A_USER = re.compile(r"user-[0-9a-f]{24}-[0-9a-f]{8}")
@@ -61,58 +57,6 @@ def cache_root() -> Path:
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache")))
     return base / "boxplus"
-
-
-@functools.cache
-def _module_files(dotted_name: str) -> tuple[Path, ...]:
-    """The file of a module; of a package also its stub, which says where the names come from that it imports on first use."""
-    path = _PACKAGE_ROOT.joinpath(*dotted_name.split(".")[1:])
-    candidates = (path.with_suffix(".py"), path / "__init__.py", path / "__init__.pyi")
-    return tuple(candidate for candidate in candidates if candidate.is_file())
-
-
-@functools.cache
-def _resolved(file: str) -> Path:
-    return Path(file).resolve()
-
-
-@functools.cache
-def _source(file: Path) -> tuple[bytes, frozenset[Path]]:
-    """Hash of a file, and the boxplus files that it imports directly."""
-    content = file.read_bytes()
-    found: set[Path] = set()
-    for package, names, module in _IMPORT.findall(content.decode("utf-8")):
-        if package.startswith("."):  # in the stubs; those of a user's file lead to no file of boxplus
-            if not file.is_relative_to(_PACKAGE_ROOT):
-                continue
-            package = ".".join(["boxplus", *file.parent.relative_to(_PACKAGE_ROOT).parts]) + package.rstrip(".")
-        candidates = [module] if module else [package]
-        candidates += [f"{package}.{name.split(' as ')[0].strip()}" for name in names.strip("()").split(",") if package]
-        found.update(path for name in candidates for path in _module_files(name))
-    # The same release in another folder, such as that of a new environment, finds what was compiled before.
-    name = file.relative_to(_PACKAGE_ROOT) if file.is_relative_to(_PACKAGE_ROOT) else file
-    return hashlib.sha256(name.as_posix().encode() + b"\n" + content).digest(), frozenset(found)
-
-
-@functools.cache
-def source_key(file: Path) -> str:
-    """Hash of `file`, of every boxplus file it depends on, of Numba's version and of the processor."""
-    pending, seen = [file], {file}
-    while pending:
-        for dependency in _source(pending.pop())[1] - seen:
-            seen.add(dependency)
-            pending.append(dependency)
-    digest = hashlib.sha256(f"{numba.__version__} {sys.implementation.cache_tag} {processor()}".encode())
-    for content in sorted(_source(path)[0] for path in seen):
-        digest.update(content)
-    return digest.hexdigest()[:24]
-
-
-@functools.cache
-def processor() -> str:
-    from llvmlite import binding
-
-    return f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"
 
 
 _told: set[str] = set()
@@ -176,7 +120,7 @@ class _KeyedLocator(_CacheLocator):  # type: ignore[misc]
         module = hashlib.sha256(py_func.__module__.encode()).hexdigest()[:8]
         # What a user wrote is known by what it does, wherever it stands.
         self._line = 0 if self.key else py_func.__code__.co_firstlineno
-        self._folder = cache_root() / "kernels" / f"{self.key or source_key(_resolved(py_file))}-{module}"
+        self._folder = cache_root() / "kernels" / f"{self.key or source_key(resolved(py_file))}-{module}"
 
     def get_cache_path(self) -> str:
         return str(self._folder)
@@ -335,7 +279,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         self._py_func, self._key, self._found = py_func, key, False
         if key is None:
             # Now, before somebody edits the file; the folder is asked for by the few functions that are called.
-            source_key(_resolved(py_func.__code__.co_filename))
+            source_key(resolved(py_func.__code__.co_filename))
 
     def _find(self) -> None:
         self._found = True
@@ -384,7 +328,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
 
 def _runtime_file(target_context: Any) -> Path:
     target = hashlib.sha256(repr(target_context.codegen().magic_tuple()).encode()).hexdigest()[:8]
-    return cache_root() / "kernels" / f"{source_key(Path(__file__).resolve())}-runtime" / f"{target}.runtime"
+    return cache_root() / "kernels" / f"{source_key(resolved(__file__))}-runtime" / f"{target}.runtime"
 
 
 def _load_runtime(target_context: Any) -> Any:

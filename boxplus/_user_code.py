@@ -18,7 +18,6 @@ import operator
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, ModuleType
 from typing import Any
 
@@ -30,7 +29,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.typing import templates
 
 from boxplus._jit import kernel
-from boxplus._kernel_cache import processor, source_key
+from boxplus._source_keys import processor, resolved, source_key
 
 # Their functions are known by name and version.
 _KNOWN = ("builtins", "math", "cmath", "operator", "numpy", "numba")
@@ -313,7 +312,7 @@ def is_kernel(value: Any) -> bool:
 
 
 def _file_key(file: str) -> str:
-    return source_key(Path(file).resolve())
+    return source_key(resolved(file))
 
 
 def _is_own(module: str | None) -> bool:

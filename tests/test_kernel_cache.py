@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from numba.core import config as numba_config
 
-from boxplus import _jit, _kernel_cache
+from boxplus import _jit, _kernel_cache, _source_keys
 
 compiles = pytest.mark.skipif(bool(numba_config.DISABLE_JIT), reason="nothing is compiled")
 posix = pytest.mark.skipif(os.name == "nt", reason="the mode of a file says nothing there")
@@ -30,21 +30,22 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (root / "middle.py").write_text("from boxplus.low.bottom import (\n    X,\n)\n")
     (root / "top.py").write_text("import numpy as np\nfrom boxplus import middle as m\n")
     (root / "aside.py").write_text("Y = 1\n")
-    monkeypatch.setattr(_kernel_cache, "_PACKAGE_ROOT", root)
+    monkeypatch.setattr(_source_keys, "_PACKAGE_ROOT", str(root))
     _forget()
     yield root
     _forget()
 
 
 def _forget() -> None:
-    _kernel_cache._module_files.cache_clear()
-    _kernel_cache._source.cache_clear()
-    _kernel_cache.source_key.cache_clear()
+    _source_keys._module_files.cache_clear()
+    _source_keys._source.cache_clear()
+    _source_keys._listing.cache_clear()
+    _source_keys.source_key.cache_clear()
 
 
 def _key(file: Path) -> str:
     _forget()
-    return _kernel_cache.source_key(file)
+    return _source_keys.source_key(str(file))
 
 
 @pytest.mark.parametrize("changed", ["top.py", "middle.py", "low/bottom.py", "low/__init__.py"])
@@ -78,7 +79,7 @@ def test_the_key_ignores_what_is_not_imported(package: Path, changed: str) -> No
 def test_the_key_is_that_of_the_same_files_elsewhere(package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = _key(package / "top.py")
     package.rename(tmp_path / "moved")
-    monkeypatch.setattr(_kernel_cache, "_PACKAGE_ROOT", tmp_path / "moved")
+    monkeypatch.setattr(_source_keys, "_PACKAGE_ROOT", str(tmp_path / "moved"))
     assert _key(tmp_path / "moved" / "top.py") == before
     outside = tmp_path / "top.py"
     outside.write_text((tmp_path / "moved" / "top.py").read_text())
@@ -92,7 +93,7 @@ def test_files_that_import_one_another_have_a_key(package: Path) -> None:
 
 def test_the_key_follows_the_processor(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = _key(package / "top.py")
-    monkeypatch.setattr(_kernel_cache, "processor", lambda: "another one")
+    monkeypatch.setattr(_source_keys, "processor", lambda: "another one")
     assert _key(package / "top.py") != before
 
 

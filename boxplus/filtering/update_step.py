@@ -65,7 +65,9 @@ def map_step(
     boxminus_into(x, x_prior, d)
     right_jacobian_into(d[T_THETA], d[T_THETA + 1], d[T_THETA + 2], J_theta)
     right_jacobian_into(d[T_THETA_L], d[T_THETA_L + 1], d[T_THETA_L + 2], J_theta_L)
-    total[:] = cov_prior
+    for i in range(TANGENT):
+        for j in range(TANGENT):
+            total[i, j] = cov_prior[i, j]
     _congruence(total, J_theta, J_theta_L)
     if not cholesky_inverse_into(total, prior_information, work):
         return False

@@ -130,7 +130,9 @@ def right_jacobian_into(xi: NDArray[np.float64], J: NDArray[np.float64]) -> None
         for i in range(7):
             J[i, i] += 1.0
         _product(A, J, product)
-        J[:] = product / (k + 1.0)
+        for i in range(7):
+            for j in range(7):
+                J[i, j] = product[i, j] / (k + 1.0)
     for i in range(7):
         J[i, i] += 1.0
     _product(A, J, E)
@@ -138,9 +140,11 @@ def right_jacobian_into(xi: NDArray[np.float64], J: NDArray[np.float64]) -> None
         E[i, i] += 1.0  # e^A = I + A φ(A)
     for _ in range(halvings):
         _product(J, E, product)
-        J[:] = 0.5 * (J + product)
+        for i in range(7):
+            for j in range(7):
+                J[i, j] = 0.5 * (J[i, j] + product[i, j])
         _product(E, E, product)
-        E[:] = product
+        E, product = product, E
 
 
 @kernel(inline=True)

@@ -24,6 +24,7 @@ _MOST_PIECES = 10_000.0  # of one node
 # Of a piece, for each power of time: a matrix, row by row, and a shift.
 _ROW = 12
 _POWERS = 4
+_K = tuple(np.int64(k) for k in range(_ROW))  # typed, as what takes a plain number is compiled for each number apart
 _NS = 1e-9
 _ONE, _TWO, _THREE = np.uint64(1), np.uint64(2), np.uint64(3)
 
@@ -97,9 +98,9 @@ def _move(
         i, j, k = _THREE * n, _THREE * n + _ONE, _THREE * n + _TWO
         s = np.float64(time_ns[n] - middle_ns)
         x, y, z = np.float64(points[i]), np.float64(points[j]), np.float64(points[k])
-        moved[i] = np.float32(_cubic(c, 0, s) * x + _cubic(c, 1, s) * y + _cubic(c, 2, s) * z + _cubic(c, 9, s))
-        moved[j] = np.float32(_cubic(c, 3, s) * x + _cubic(c, 4, s) * y + _cubic(c, 5, s) * z + _cubic(c, 10, s))
-        moved[k] = np.float32(_cubic(c, 6, s) * x + _cubic(c, 7, s) * y + _cubic(c, 8, s) * z + _cubic(c, 11, s))
+        moved[i] = np.float32(_cubic(c, _K[0], s) * x + _cubic(c, _K[1], s) * y + _cubic(c, _K[2], s) * z + _cubic(c, _K[9], s))
+        moved[j] = np.float32(_cubic(c, _K[3], s) * x + _cubic(c, _K[4], s) * y + _cubic(c, _K[5], s) * z + _cubic(c, _K[10], s))
+        moved[k] = np.float32(_cubic(c, _K[6], s) * x + _cubic(c, _K[7], s) * y + _cubic(c, _K[8], s) * z + _cubic(c, _K[11], s))
 
 
 @kernel
@@ -163,7 +164,7 @@ def _cut(
                         polynomial[3 * i + j] = scale * next_E[i, j]
                     polynomial[9 + i] = scale * (E[i, 0] * x_end[PL] + E[i, 1] * x_end[PL + 1] + E[i, 2] * x_end[PL + 2])
                 _product(E, hat, next_E)
-                E[:] = next_E
+                E, next_E = next_E, E
                 scale *= _NS / (power + 1)
             for i in range(3):
                 pieces[at, 9 + i] += c[0, i] + s * (c[1, i] + s * c[2, i])

@@ -47,7 +47,8 @@ def solve_unit_columns(variable: int, targets: Indices, mark: int, table: Table,
             count += 1
             most = max(most, table[c]["width"] + table[c]["below"])
             c = table[c]["parent"]
-        path[first:count] = path[first:count][::-1].copy()
+        for k in range((count - first) // 2):
+            path[first + k], path[count - 1 - k] = path[count - 1 - k], path[first + k]
     c = clique_of[variable]
     while c != ROOT:
         most = max(most, table[c]["width"] + table[c]["below"])

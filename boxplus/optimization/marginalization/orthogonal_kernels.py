@@ -342,7 +342,8 @@ def add_rows(
                 rank = eliminate_columns(A, X, rows, reach, shares, least, order, head, W)
                 for c in range(k):
                     shares[c] = lengths[order[c]]
-                lengths[:k] = shares[:k]
+                for c in range(k):
+                    lengths[c] = shares[c]
                 for j in range(k):
                     for c in range(k):
                         if order[c] == position[j]:

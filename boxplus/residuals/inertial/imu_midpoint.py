@@ -31,7 +31,8 @@ from boxplus.residuals.matrix3 import (
     transposed,
 )
 
-ALPHA, THETA, BETA, BIAS_ACCEL, BIAS_GYRO = 0, 3, 6, 9, 12  # first row of each block of the error state
+# First row of each block of the error state; typed, as what takes a plain number is compiled for each number apart.
+ALPHA, THETA, BETA, BIAS_ACCEL, BIAS_GYRO = (np.int64(row) for row in (0, 3, 6, 9, 12))
 GAP_S = 0.1  # between samples: above it the midpoint rule is too coarse, and what happens between the samples counts
 _GAP_NS, _GAP_STEP_NS = round(1e9 * GAP_S), 10_000_000  # of a step across a gap
 

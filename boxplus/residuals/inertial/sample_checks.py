@@ -86,4 +86,4 @@ def checked_bias(name: str, bias: ArrayLike, count: int) -> NDArray[np.float64]:
             f"{array.shape} {array.ravel()[:3]}",
             "give one bias for each interval",
         )
-    return np.array(np.broadcast_to(array, (count, 3)))
+    return np.array(np.broadcast_to(array, (count, 3)), order="C")  # the layout that the kernels are compiled for

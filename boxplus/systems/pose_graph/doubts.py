@@ -282,7 +282,9 @@ def _mark_singular(matrices: NDArray[np.float64], singular: NDArray[np.bool_]) -
     dim = matrices.shape[1]
     work = np.empty((dim, dim))
     for m in range(matrices.shape[0]):
-        work[:] = matrices[m]
+        for i in range(dim):
+            for j in range(dim):
+                work[i, j] = matrices[m, i, j]
         singular[m] = False
         for k in range(dim):
             pivot = work[k, k]

@@ -19,7 +19,7 @@ from boxplus._chi_square import chi_square_cdf
 from boxplus.errors import BoxplusError
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.optimization.minimizers.minimize import Callback
-from boxplus.optimization.solution import Solution
+from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.pose_graph.named import named
@@ -31,6 +31,7 @@ _AS_PROMISED = (0.6, 1.6)  # χ² of rotations and of translations, where a read
 _LEAST_SPARE = 10.0  # redundancy from which on either is judged on its own
 _LIKELY = (0.1, 3e4)  # the same before poses are found anew
 _STEPS = 20
+_SOON, _FAR = 8, 100.0  # steps, and χ² over what is promised, that a reading which is right is below by then, by far
 _SLACK, _UNLIKE = 0.25, 4.0  # χ² of rotations or translations that is told of, and how many times that the other has
 _SURE = 1e-6  # chance that noise as promised makes it as small
 _NO_ERROR = 1e-6  # standard deviations, up to which errors along an axis are none, as of a plane in space
@@ -119,7 +120,14 @@ def information_doubt(
     if as_read is None or as_read.is_as_promised:
         return None
     best: tuple[_Fits, str] | None = None
-    watch = named(callback, "information in another unit?")
+    told, is_hopeless = named(callback, "information in another unit?"), False
+
+    def watch(step: Iteration) -> bool:
+        nonlocal is_hopeless
+        is_stopped = told is not None and bool(told(step))
+        is_hopeless = not is_stopped and step.number >= _SOON and 2.0 * step.cost > _FAR * dof
+        return is_stopped or is_hopeless
+
     for information, meant in _readings(graph.information):
         other = replace(graph, information=information)
         if not as_read.is_likely(other, poses):
@@ -127,7 +135,7 @@ def information_doubt(
         try:
             problem, anew = pose_graph_problem(other, held=held, loss=None, objective="logarithm")
             found = problem.solve(options.model_copy(update={"max_iterations": _STEPS}), start=[poses], callback=watch)
-            if found.status == "stopped" and found.limit != "steps":
+            if found.status == "stopped" and found.limit != "steps" and not is_hopeless:
                 return None
             is_near = _AS_PROMISED[0] < 2.0 * found.cost / dof < _AS_PROMISED[1]  # what is known of each part takes longest
             reliability = Reliability.of(other, found, anew) if is_near else None

@@ -12,7 +12,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtri
 
 from boxplus.errors import BoxplusError
 from boxplus.formats.reconstructions.bal import BalProblem
@@ -126,6 +125,8 @@ def _by_chance(numbers: int, left: int) -> float:
 
     The noise is that of the errors, not what sigma says. Of few measurements these know it badly, which counts.
     """
+    from scipy.special import fdtri  # here, as most runs never ask, and it takes longer to import than they to adjust
+
     return numbers / left * float(fdtri(numbers, left, 1.0 - _CHANCE))
 
 
