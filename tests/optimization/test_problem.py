@@ -211,6 +211,14 @@ def test_units_do_not_decide_what_is_converged(method, sigma):
     assert solution[x][0, 0] == pytest.approx(6.0, rel=1e-6)
 
 
+def test_the_analysis_is_that_of_the_next_solve(ring):
+    problem = ring.problem
+    assert problem.analysis(SolverOptions(linear_solver="dense")) is None
+    options = SolverOptions(linear_solver="sparse")
+    analysis = problem.analysis(options)
+    assert analysis is not None and problem.solve(options)._problem.system.analysis is analysis
+
+
 def test_values_are_nobody_elses(scene):
     problem, points = scene.problem, scene.points
     problem.fix(points)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import special_ortho_group
@@ -43,6 +45,15 @@ def test_both_starts_are_exact_without_noise(dimension, pieces):
     np.testing.assert_array_equal(held_poses(graph), np.arange(pieces))
     for start in (spanning_tree_start(graph), chordal_start(graph)):
         np.testing.assert_allclose(manifold.boxminus(start, truth), 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("fixed", [[], [3, 7, 20]])
+def test_the_chordal_start_is_the_same_in_any_order_of_elimination(dimension, fixed):
+    graph, truth = random_graph(dimension, noise=0.05)
+    graph = replace(graph, poses=truth, fixed=np.array(fixed, dtype=np.int64))
+    order = np.random.default_rng(0).permutation(len(graph.ids) - len(held_poses(graph)))
+    np.testing.assert_allclose(chordal_start(graph, order), chordal_start(graph), atol=1e-9)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
