@@ -19,7 +19,7 @@ import os
 import sys
 import tempfile
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +46,9 @@ RECORDINGS = {  # recording, ground truth, calibration where it is a file of its
     "mh01": ("euroc_mh01_stereo_imu_11s", "euroc_mh01_stereo_imu_11s/groundtruth.tum", None),
     "v103_stereo": ("v103_stereo.bag", "v103_stereo.gt.tum", "v103_stereo.calib.yaml"),
     "mh05_stereo": ("mh05_stereo", "mh05_stereo/gt.tum", None),
+    "mh05_low_texture": ("mh05_stereo_low_texture", "mh05_stereo_low_texture/gt.tum", None),
 }
+TIMED = ("mh01", "v103_stereo", "mh05_stereo")
 FRAME_BAR, TAIL_BAR = 2.2, 2.0
 WARM = 5  # frames after the start that do not count
 SETTLED_MIN = 5.0
@@ -73,24 +75,32 @@ class TimedCalls:
         return timed
 
 
-def folder_of(name: str, shared: Path) -> Path | None:
-    """Where the recording lies; None, with a message, where it is not."""
+@dataclass(frozen=True, slots=True)
+class Files:
+    """Recording, ground truth, and calibration where it is a file of its own."""
+
+    recording: Path
+    truth: Path
+    calibration: Path | None = None
+
+
+def files_of(name: str, shared: Path) -> Files | None:
+    """Where a recording lies; None, with a message, where it is not."""
     folder = shared / "data" / "cameras"
-    if (folder / RECORDINGS[name][0]).exists():
-        return folder
-    print(f"vio: {RECORDINGS[name][0]} is not in {folder}, left out", file=sys.stderr)
+    recording, truth, calibration = RECORDINGS[name]
+    if (folder / recording).exists():
+        return Files(folder / recording, folder / truth, None if calibration is None else folder / calibration)
+    print(f"vio: {recording} is not in {folder}, left out", file=sys.stderr)
     return None
 
 
-def frames(folder: Path, name: str, config: VioConfig) -> tuple[list[VioEstimate], NDArray[np.float64]]:
+def frames(files: Files, config: VioConfig) -> tuple[list[VioEstimate], NDArray[np.float64]]:
     """Every estimate, and (n, 2) milliseconds of the frame and of the calls of OpenCV in it."""
     import cv2
 
     cv2.setNumThreads(1)
-    path, _, calibration = RECORDINGS[name]
-    given = CameraRecordingOptions(calibration=None if calibration is None else folder / calibration)
     estimates, spent = [], []
-    with open_camera_recording(folder / path, given) as recording:
+    with open_camera_recording(files.recording, CameraRecordingOptions(calibration=files.calibration)) as recording:
         vio = VisualInertialOdometry(config, rig_of_recording(recording.info, config))
         calls = vio._tracker._cv2 = TimedCalls(cv2)  # type: ignore[attr-defined]
         passed = 0.0
@@ -105,29 +115,37 @@ def frames(folder: Path, name: str, config: VioConfig) -> tuple[list[VioEstimate
     return estimates, np.array(spent)
 
 
-def position_error(known: list[VioEstimate], folder: Path, name: str) -> float:
-    """Root mean square after alignment by yaw and translation [cm] of estimates after the start."""
+def with_pose(estimates: list[VioEstimate]) -> list[VioEstimate]:
+    """Those from the start on."""
+    return [estimate for estimate in estimates if estimate.status != "starting"]
+
+
+def trajectory_of(known: list[VioEstimate]) -> Trajectory:
+    """Of estimates after the start."""
     T = np.array([e.T_world_imu for e in known])
-    path = Trajectory(np.array([e.time_ns for e in known]), T[:, :3, 3], quaternion.from_matrix(T[:, :3, :3]))
-    truth = read_trajectory(folder / RECORDINGS[name][1])
-    return 100.0 * evaluate(path, truth, alignment="yaw", method="interpolate").ate.rmse
+    return Trajectory(np.array([e.time_ns for e in known]), T[:, :3, 3], quaternion.from_matrix(T[:, :3, :3]))
+
+
+def position_error(known: list[VioEstimate], files: Files) -> float:
+    """Root mean square after alignment by yaw and translation [cm] of estimates after the start."""
+    truth = read_trajectory(files.truth)
+    return 100.0 * evaluate(trajectory_of(known), truth, alignment="yaw", method="interpolate").ate.rmse
 
 
 def metrics_of(name: str, shared: Path) -> list[Metric]:
     """Time and accuracy on one recording."""
-    folder = folder_of(name, shared)
-    if folder is None:
+    files = files_of(name, shared)
+    if files is None:
         return []
-    frames(folder, name, VioConfig())  # compiles, and warms up
-    estimates, spent = frames(folder, name, VioConfig())
+    frames(files, VioConfig())  # compiles, and warms up
+    estimates, spent = frames(files, VioConfig())
     is_known = np.array([e.status != "starting" for e in estimates])
-    known = [e for e in estimates if e.status != "starting"]
     total, opencv = spent[is_known][WARM:].T
     median = float(np.median(total))
     return [
         Metric(f"vio/{name}: frame", median, "ms", "lower", FRAME_BAR, "OpenCV in it", float(np.median(opencv)), 0.2),
         Metric(f"vio/{name}: 99th percentile over median", float(np.quantile(total, 0.99)) / median, "ratio", bar=TAIL_BAR),
-        Metric(f"vio/{name}: position error", position_error(known, folder, name), "cm", tolerance=0.2),
+        Metric(f"vio/{name}: position error", position_error(with_pose(estimates), files), "cm", tolerance=0.2),
     ]
 
 
@@ -166,14 +184,14 @@ def memory_metrics(minutes: float) -> list[Metric]:
 def measure(options: argparse.Namespace) -> list[Metric]:
     """What the options ask for."""
     metrics = [
-        metric for name in (RECORDINGS if options.only is None else options.only) for metric in metrics_of(name, options.shared)
+        metric for name in (TIMED if options.only is None else options.only) for metric in metrics_of(name, options.shared)
     ]
     return metrics + (memory_metrics(options.minutes) if options.minutes else [])
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shared", type=Path, default=HERE.parent.parent / "shared")
-    parser.add_argument("--only", nargs="*", choices=list(RECORDINGS), help="recordings; all of them if left out")
+    parser.add_argument("--only", nargs="*", choices=TIMED, help="recordings; all of them if left out")
     parser.add_argument("--minutes", type=float, default=0.0, help="of the simulated walk; none if left out")
 
 

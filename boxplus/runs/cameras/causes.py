@@ -16,7 +16,7 @@ from boxplus.recordings.cameras.info import CameraRecordingInfo, CameraStream
 from boxplus.recordings.info import Evidence
 from boxplus.recordings.stream_checks import check_rate
 from boxplus.runs.inspection.cameras.comparison import Comparison
-from boxplus.runs.inspection.cameras.views import GAP_FACTOR, Views, check_views
+from boxplus.runs.inspection.cameras.views import GAP_FACTOR, Views, check_corners, check_views
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.imu import ImuSamples
 
@@ -46,7 +46,9 @@ def likely_causes(
     if compared is None:
         return []
     comparison, imu = compared
-    found = [finding for camera in _pictures(info, cameras) for finding in _of_images(camera.name, views[camera.index])]
+    pictures = _pictures(info, cameras)
+    found = [finding for camera in pictures for finding in _of_images(camera.name, views[camera.index])]
+    found += check_corners(pictures[0].name, comparison.turns.followed, views[pictures[0].index])
     return _told(found + comparison.of_cameras() + (comparison.with_imu(imu) if with_imu and len(imu) else []))
 
 

@@ -19,6 +19,7 @@ from boxplus.runs.cameras.causes import BEFORE_S, MAY_BE, calibration_doubts, li
 from boxplus.runs.cameras.folder import VioFolder, claim_camera_folder
 from boxplus.runs.cameras.landmark_file import LandmarkFile, LandmarksById, write_lines
 from boxplus.runs.cameras.turning import Turning
+from boxplus.runs.estimate_statistics import GapWatch
 from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_loop import Progress
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
@@ -41,7 +42,7 @@ _TOLD = {
 }  # of the tests of a start; `run.json` has all of them
 _OWN_STATE = (
     "_images", "_rejected", "_lines_rejected", "_keyframes", "_before_start", "_mountings", "_time_offset_s",
-    "_troubled_ns", "_turning",
+    "_troubled_ns", "_turning", "_image_gaps",
 )  # fmt: skip
 _MUCH_LOST = 0.15  # share of the frames
 _VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark does not enter the map
@@ -132,7 +133,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         self._troubled_ns: int | None = None
         self._causes: list[str] = []
         self._doubts: list[str] = []
-        self._turning = Turning(BEFORE_S)
+        self._turning, self._image_gaps = Turning(BEFORE_S), GapWatch()
         self._longest_gap_s = config.odometry.max_imu_gap
 
     def open(self, stack: ExitStack) -> None:
@@ -182,6 +183,8 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         began = time.perf_counter()
         if isinstance(event, CameraImage):
             self._images[event.camera] += 1
+            if event.camera == 0:
+                self._image_gaps.add(np.array([event.time_ns], np.int64))
             estimates = self._odometry.push_image(event) if event.camera < len(self._rig.cameras) else []
         else:
             self.counts.add_imu(event.time_ns)
@@ -273,15 +276,23 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         )
 
     def _gap_warnings(self) -> list[WarningFacts]:
-        """Times on the way at which the IMU was silent, and enough was seen to go on."""
-        ends_s = self.counts.duration_s
-        on_the_way = [gap for gap in self.counts.imu_gaps() if gap.begin_s + gap.duration_s > 0.0 and gap.begin_s < ends_s]
-        silent = [gap for gap in on_the_way if gap.duration_s > self._longest_gap_s]
-        if not silent or self._odometry.contradiction is not None:
+        """Times on the way at which the IMU was silent, or the first camera was, and enough was known to go on."""
+        if self.counts.first_time_ns is None or self._odometry.contradiction is not None:
             return []
-        longest = max(gap.duration_s for gap in silent)
-        text = f"a gap of {longest:.2f} s in the samples of the IMU: images alone tell the way across it"
-        return [WarningFacts(text=text, count=len(silent), first_s=silent[0].begin_s)]
+        silent = [gap for gap in self.counts.imu_gaps() if gap.duration_s > self._longest_gap_s]
+        told = [
+            (silent, "samples of the IMU: images alone tell the way across it"),
+            (self._image_gaps.gaps(self.counts.first_time_ns), "images of the first camera: the IMU tells the way across it"),
+        ]
+        warnings = []
+        for gaps, text in told:
+            gaps = [gap for gap in gaps if gap.begin_s + gap.duration_s > 0.0 and gap.begin_s < self.counts.duration_s]
+            if gaps:
+                longest = max(gap.duration_s for gap in gaps)
+                warnings.append(
+                    WarningFacts(text=f"a gap of {longest:.2f} s in the {text}", count=len(gaps), first_s=gaps[0].begin_s)
+                )
+        return warnings
 
     def _cameras(self) -> list[CameraFacts]:
         facts = []

@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from boxplus._extras import require
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion, so3
-from boxplus.manifolds.nearest_rotation import nearest_rotation
 from boxplus.sensors.image import Image
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.tracking import FeatureTracker
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.corners.triangulation import inverse_depths
+from boxplus.systems.visual_inertial_odometry.corners.turning import distances, turn_between
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 
 Matrix = NDArray[np.float64]
@@ -133,7 +133,7 @@ class TwoViewStart:
         m1, m2 = before.rays[i, 0], tracks.rays[j, 0]
         f, size = self._camera.fx, sum(image.shape)
         moved = f * float(np.median(np.linalg.norm(m2 - m1, axis=1)))
-        left = f * float(np.median(_distance(_turn(m1, m2), m1, m2)))
+        left = f * float(np.median(distances(turn_between(m1, m2), m1, m2)))
         if left < _LEAST_PARALLAX * size:
             self.problem = (
                 f"corners moved by {moved:.1f} pixels, of which a rotation leaves {left:.1f} ({_LEAST_PARALLAX * size:.1f} are "
@@ -152,22 +152,6 @@ class TwoViewStart:
         return TwoViews((first_ns, time_ns), first, image, T_21, (float(low) / _BEYOND, float(high) * _BEYOND))
 
 
-def _turn(m1: Matrix, m2: Matrix) -> Matrix:
-    """The rotation that takes corners (n, 3) of z = 1 closest to where they are, by the sum of the distances."""
-    a, b = (m / np.linalg.norm(m, axis=1, keepdims=True) for m in (m1, m2))
-    weight, R = np.ones(len(a)), np.eye(3)
-    for _ in range(5):
-        R = nearest_rotation((weight[:, None] * b).T @ a)
-        distance = _distance(R, m1, m2)
-        weight = 1.0 / np.maximum(distance, 0.5 * float(np.median(distance)) + 1e-12)
-    return R
-
-
-def _distance(R: Matrix, m1: Matrix, m2: Matrix) -> Matrix:
-    there = m1 @ R.T
-    return np.asarray(np.linalg.norm(there[:, :2] / there[:, 2:] - m2[:, :2], axis=1))
-
-
 def _sampson(R: Matrix, t: Matrix, m1: Matrix, m2: Matrix) -> Matrix:
     E = so3.hat(t) @ R
     one, two = m1 @ E.T, m2 @ E
@@ -176,7 +160,7 @@ def _sampson(R: Matrix, t: Matrix, m1: Matrix, m2: Matrix) -> Matrix:
 
 def _essential(m1: Matrix, m2: Matrix, f: float, parallax: float) -> tuple[Matrix, Matrix, Matrix] | str:
     """R_21, t_21 of length 1, and the inverse depths of those that agree in camera 1; or why not."""
-    starts = [(_turn(m1, m2), direction) for direction in _directions()] + _sampled(m1, m2, f)
+    starts = [(turn_between(m1, m2), direction) for direction in _directions()] + _sampled(m1, m2, f)
     motions = sorted((_refined(R, t, m1, m2, f) for R, t in starts), key=lambda motion: motion.cost)
     best = motions[0]
     sigma = best.sigma

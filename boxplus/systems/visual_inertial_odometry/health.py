@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.corners.partners import FLAT, LEAST_SHARE, few_are_found, share_found
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.estimate import Status
 from boxplus.systems.visual_inertial_odometry.observations import Fit
@@ -24,10 +25,9 @@ _UNKNOWN_M = 100.0  # standard deviation of a position that is none
 _IMU_RATIO = 1.0  # residuals of the IMU over what its noise explains
 _FIT_RATIO = 2.5  # residuals of the corners over what their noise explains
 _MEMORY = 0.9  # of the running means, per frame
-_LEAST_PARTNERS = 0.15  # share of the corners that a second camera finds where the calibration puts them
 _SUSTAINED_S = 1.0  # of a contradiction that is no accident
 _TORN_M = 0.5  # standard deviation of the position after a gap of the IMU beyond which the way across it was not seen
-_DARK, _FLAT = 12.0, 5.0  # grey values: mean and standard deviation of an image that shows nothing
+_DARK = 12.0  # grey values: mean of an image that shows nothing
 
 
 @dataclass(slots=True)
@@ -110,8 +110,8 @@ class Health:
         sentences = []
         if self._disagreeing > _DISAGREE:
             sentences.append(
-                f"{100 * self._disagreeing:.0f} % of the landmarks seen are not where they should be: much of the view moves on "
-                f"its own, or cameras and IMU do not belong together as calibrated ({self._calibrated(tracks)})"
+                f"{100 * self._disagreeing:.0f} % of the landmarks seen are not where they should be: a moving object fills "
+                f"much of the view, or cameras and IMU do not belong together as calibrated ({self._calibrated(tracks)})"
             )
         if self._imu_ratio > _IMU_RATIO:
             sentences.append(
@@ -123,14 +123,11 @@ class Health:
                 f"landmarks fit to {self._fit_ratio * self.config.pixel_sigma:.1f} px, where {self.config.pixel_sigma:g} px are "
                 "expected: check the calibration of the cameras"
             )
-        if tracks.pixels.shape[1] > 1 and len(tracks) >= _ENOUGH and (tracks.contrast > _FLAT).all():
-            partners = np.isfinite(tracks.pixels[:, 1:, 0]).any(axis=1).mean()
-            self._partners += new * (float(partners) - self._partners)
-        if self._partners < _LEAST_PARTNERS:
-            sentences.append(
-                f"{100 * self._partners:.0f} % of the corners are found in a second camera, where it should see them: check "
-                "which camera is which, and T_imu_camera"
-            )
+        partners = share_found(tracks)
+        if partners is not None:
+            self._partners += new * (partners - self._partners)
+        if self._partners < LEAST_SHARE:
+            sentences.append(few_are_found(self._partners))
         return sentences
 
     @staticmethod
@@ -144,7 +141,7 @@ class Health:
         brightness, contrast = float(tracks.brightness[0]), float(tracks.contrast[0])
         if np.isnan(brightness):
             return "; the first camera delivered no image"
-        if contrast < _FLAT or brightness < _DARK:
+        if contrast < FLAT or brightness < _DARK:
             what = "dark or covered" if brightness < 2.0 * _DARK else "without texture"
             return f"; the image is {what}: mean {brightness:.0f}, standard deviation {contrast:.1f} of 255"
         return f" ({len(tracks)} corners were followed)"

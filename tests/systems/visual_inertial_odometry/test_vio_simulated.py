@@ -182,7 +182,7 @@ def test_what_moves_on_its_own_is_left_out_or_named() -> None:
     _, estimates = run(flight, rig(), CONFIG, SimulatedTracker(flight, rig(), moving=0.5))
     known = [e for e in estimates if e.status != "starting"]
     error, covariance = position_and_yaw_error(flight, known[0], known[-1])
-    named = [r for e in known for r in e.reasons if "moves on its own" in r]
+    named = [r for e in known for r in e.reasons if "a moving object" in r]
     assert named or (np.abs(error) < 4.0 * np.sqrt(np.diag(covariance))).all()
     assert sum(e.rejected["does not fit the window"] for e in known if at(flight, e) > 640) > 50
 

@@ -17,6 +17,7 @@ from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.start import Start, find_rest, moving_start
+from boxplus.systems.visual_inertial_odometry.start.turn_on_the_spot import turn_on_the_spot
 
 _EVERY_NS = 150_000_000
 _SHARE, _LONGEST_WAIT_NS = 0.2, 2_000_000_000  # of the time since the first attempt
@@ -65,7 +66,8 @@ class StartSearch:
             moving = moving_start(seen, imu, rig, config)
             if isinstance(moving, Start):
                 return moving
-            self._motion_problem = moving
+            turning = turn_on_the_spot(seen, rig.cameras[0].model.fx) if len(rig.cameras) == 1 else None
+            self._motion_problem = moving if turning is None else f"{moving}; {turning}"
             self._first_attempt_ns = self._first_attempt_ns or now_ns
             wait_ns = round(_SHARE * (now_ns - self._first_attempt_ns))
             spare_ns = round((_LONGEST_START - 1.0) * config.start_duration * 1e9) - _EVERY_NS
