@@ -117,6 +117,7 @@ class Health:
             sentences.append(
                 f"the IMU disagrees with the cameras: what is left between them is {self._imu_ratio:.2f} times what its noise "
                 f"explains, where {_IMU_RATIO:g} is the most: check its noise, its clock, and how the cameras are mounted"
+                f"{', their baseline too' if tracks.pixels.shape[1] > 1 else ''}"
             )
         if self._fit_ratio > _FIT_RATIO:
             sentences.append(

@@ -278,7 +278,7 @@ class VisualInertialOdometry:
     def _rate(self, time_ns: int) -> NDArray[np.float64]:
         """Angular velocity (3,) that the gyroscope measured at a time of the cameras' clock [rad/s]."""
         at = time_ns + self.window.cut_ns
-        first = int(np.clip(np.searchsorted(self._imu.time_ns, at) - 1, 0, max(len(self._imu) - 2, 0)))
+        first = min(max(int(self._imu.time_ns.searchsorted(at)) - 1, 0), max(len(self._imu) - 2, 0))
         near = slice(first, first + 2)
         after_s = 1e-9 * (self._imu.time_ns[near] - at)
         return np.array([np.interp(0.0, after_s, self._imu.gyro[near, k]) for k in range(3)])

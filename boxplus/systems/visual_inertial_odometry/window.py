@@ -29,7 +29,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.beginning import beginning, covariance_of
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.creep import CornerCreep
-from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks, most_are_below, motion_px
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks, most_are_below, motion_px, shared_rows
 from boxplus.systems.visual_inertial_odometry.corners.triangulation import mean_parallax, triangulate
 from boxplus.systems.visual_inertial_odometry.frame_solver import FrameSolver
 from boxplus.systems.visual_inertial_odometry.imu_step import imu_step
@@ -142,7 +142,7 @@ class Window:
         """The next frame, at its predicted pose and state; what it saw of landmarks, and for a keyframe new landmarks."""
         self._add(tracks, pose, state, is_keyframe, imu)
         number = self.frames[-1].number
-        _, landmark, row = np.intersect1d(self._track, tracks.ids, assume_unique=True, return_indices=True)
+        landmark, row = shared_rows(self._track, tracks.ids)
         camera, k = np.nonzero(np.isfinite(tracks.pixels[row][:, :, 0]).T)
         self._seen.add(np.full(len(k), number), self.points.ids[landmark[k]], camera, tracks.pixels[row[k], camera])
         self.lines.add(number, tracks.lines)
@@ -219,7 +219,7 @@ class Window:
             return True
         # One camera that has not moved yet knows no landmark: then corners that are lost have to be replaced as well.
         known, founded = (self._track, self._founded) if self._founded else (last.tracks.ids, len(last.tracks))
-        if np.isin(tracks.ids, known).sum() < self._config.keyframe_tracked * founded:
+        if len(shared_rows(known, tracks.ids)[0]) < self._config.keyframe_tracked * founded:
             return True
         poses = self.bodies.values[self._row(last.number)], pose
         return mean_parallax(last.tracks, tracks, *poses, self._rig.cameras[0]) > self._config.keyframe_parallax
@@ -252,13 +252,13 @@ class Window:
         """Residuals of these observations, and of the IMU's first intervals; of no others."""
         self._disconnect()
         seen = self._seen
-        anchor = self._anchor[self.points.rows_of(seen.landmark)]
         if len(rows):
+            anchor = self._anchor[self.points.rows_of(seen.landmark[rows])]
             models = [mounted.model for mounted in self._rig.cameras]
             camera, sigma = seen.camera[rows], self._config.pixel_sigma * self._creep.weight
             group = self.problem.add_residuals(
                 OnBody(InverseDepthReprojection(models, seen.pixel[rows], camera_of=camera, sigma=sigma)),
-                self.bodies[anchor[rows]],
+                self.bodies[anchor],
                 self.mountings[[0]],
                 self.bodies[seen.frame[rows]],
                 self.mountings[camera],

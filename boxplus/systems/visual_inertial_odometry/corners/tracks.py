@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
 from boxplus.systems.visual_inertial_odometry.lines.tracks import LineTracks
 
 _MOST = 0.8
@@ -45,9 +46,31 @@ class Tracks:
         return len(self.ids)
 
 
+def shared_rows(ids: NDArray[np.int64], ascending: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Where the ids that both have stand in each of them, in the order of the second; no id stands twice in one."""
+    rows, others = np.empty((2, min(len(ids), len(ascending))), dtype=np.intp)
+    count = _share(ids, ascending, rows, others)
+    return rows[:count], others[:count]
+
+
+@kernel
+def _share(ids: NDArray[np.int64], ascending: NDArray[np.int64], rows: NDArray[np.intp], others: NDArray[np.intp]) -> int:
+    place = np.full(len(ascending), -1)
+    for k in range(len(ids)):
+        at = np.searchsorted(ascending, ids[k])
+        if at < len(ascending) and ascending[at] == ids[k]:
+            place[at] = k
+    count = 0
+    for at in range(len(ascending)):
+        if place[at] >= 0:
+            rows[count], others[count] = place[at], at
+            count += 1
+    return count
+
+
 def motion_px(before: Tracks, now: Tracks) -> NDArray[np.float64]:
     """By how much each corner that both saw has moved in the first camera (n,) [px]."""
-    _, then, there = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    then, there = shared_rows(before.ids, now.ids)
     return np.asarray(np.linalg.norm(now.pixels[there, 0] - before.pixels[then, 0], axis=1))
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.manifolds import quaternion
-from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks, shared_rows
 from boxplus.systems.visual_inertial_odometry.rig import RigCamera
 
 _MOST_SIGMAS = 5.0  # by which a view may differ from the point found
@@ -77,7 +77,7 @@ def mean_parallax(before: Tracks, now: Tracks, body_before: Floats, body_now: Fl
         body_before, body_now: (7,) T_world_imu, of which only the attitude counts.
         camera: the first one of the rig.
     """
-    _, then, there = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    then, there = shared_rows(before.ids, now.ids)
     if not len(there):
         return float("inf")
     R_before, R_now = (quaternion.to_matrix(body[:4]) @ camera.T_imu_camera[:3, :3] for body in (body_before, body_now))

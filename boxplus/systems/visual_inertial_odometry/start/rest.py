@@ -10,7 +10,7 @@ import numpy as np
 from boxplus.manifolds import so3
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.sensors.imu import ImuSamples
-from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks, shared_rows
 from boxplus.systems.visual_inertial_odometry.start.ray_tracks import Floats
 
 STILL_PX = 0.5  # median motion of the corners in half of the window, beyond that from image to image, which is noise
@@ -118,7 +118,7 @@ def _motion(seen: Sequence[Tracks], step: int) -> tuple[float, float]:
     """Fewest corners that two frames `step` apart share, and the mean of the medians of how far they moved [px]."""
     shared, moved = [], []
     for first, second in zip(seen[:-step], seen[step:], strict=True):
-        _, i, j = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
+        i, j = shared_rows(first.ids, second.ids)
         motion = np.linalg.norm(second.pixels[j, 0] - first.pixels[i, 0], axis=1)
         motion = motion[np.isfinite(motion)]
         shared.append(len(motion))

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks, shared_rows
 from boxplus.systems.visual_inertial_odometry.corners.turning import distances, turn_between
 
 _APART_NS = 500_000_000
@@ -41,7 +41,7 @@ def _pairs(seen: Sequence[Tracks]) -> Iterator[tuple[float, float]]:
     for tracks in seen[1:]:
         if tracks.time_ns - before.time_ns < _APART_NS:
             continue
-        _, i, j = np.intersect1d(before.ids, tracks.ids, assume_unique=True, return_indices=True)
+        i, j = shared_rows(before.ids, tracks.ids)
         m1, m2 = before.rays[i, 0], tracks.rays[j, 0]
         before = tracks
         if len(i) >= _FEWEST:
