@@ -78,7 +78,8 @@ class Watch:
         if ratio > self._config.residual_ratio:
             reasons.append(
                 f"grey values differ by {alignment.sigma:.3g}, {ratio:.1f} times as much as in the frames before "
-                f"({self._config.residual_ratio:g} at most): something moves, light changed unevenly, or the image is blurred"
+                f"({self._config.residual_ratio:g} at most): something moves by itself, "
+                "light changed unevenly, or the image is blurred"
             )
             if ratio > _LOST_RATIO * self._config.residual_ratio:
                 return Verdict("lost", tuple(reasons), ratio)

@@ -44,6 +44,8 @@ def _pairs(seen: Sequence[Tracks]) -> Iterator[tuple[float, float]]:
         i, j = shared_rows(before.ids, tracks.ids)
         m1, m2 = before.rays[i, 0], tracks.rays[j, 0]
         before = tracks
-        if len(i) >= _FEWEST:
+        ahead = (m1[:, 2] > 0.0) & (m2[:, 2] > 0.0)  # not so of what the first camera does not see, or behind a wide lens
+        m1, m2 = m1[ahead], m2[ahead]
+        if len(m1) >= _FEWEST:
             moved = float(np.median(np.linalg.norm(m2 - m1, axis=1)))
             yield moved, float(np.median(distances(turn_between(m1, m2), m1, m2)))

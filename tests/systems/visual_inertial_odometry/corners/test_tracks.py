@@ -66,6 +66,11 @@ def test_a_turn_on_the_spot_is_told_from_other_motions_and_from_rest() -> None:
     assert turn_on_the_spot(seen_along(still, np.array([0.2, 0.0, 0.0])), FOCAL_PX) is None
     assert turn_on_the_spot(seen_along(still, still), FOCAL_PX) is None
     assert turn_on_the_spot(seen_along(turn, still)[:4], FOCAL_PX) is None  # less than half a second
+    partly = seen_along(turn, still)
+    for frame in partly:
+        frame.rays[:9] = np.nan
+    again = turn_on_the_spot(partly, FOCAL_PX)
+    assert again is not None and "a rotation leaves 0.0 px" in again
 
 
 def test_the_share_that_a_second_camera_finds_is_told_where_all_show_something() -> None:
