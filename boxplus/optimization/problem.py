@@ -32,7 +32,7 @@ from boxplus.optimization.terms.variables import VariableRows, Variables
 from boxplus.optimization.terms.weighting import checked_weights
 from boxplus.residuals.marginal_prior import MarginalPrior
 from boxplus.residuals.residual import Residual
-from boxplus.sparse.cholesky import Analysis, NotPositiveDefinite
+from boxplus.sparse.cholesky import Analyses, NotPositiveDefinite
 
 # Share of a group that may have lost its weight before the problem is analysed anew without it.
 _STALE = 0.05
@@ -58,7 +58,7 @@ class Problem:
         self.groups: list[Group] = []
         self._added = 0  # groups, ever: the number in a name is not given twice
         self._analysed: tuple[tuple[Any, ...], LeastSquares, tuple[str, ...]] | None = None
-        self._factor: Analysis | None = None  # of the last matrix, whose pattern often comes again
+        self._known = Analyses()  # of the last matrices, whose patterns often come again
 
     @changes
     def add_variables(self, manifold: Manifold, values: ArrayLike, *, name: str | None = None) -> Variables:
@@ -392,8 +392,7 @@ class Problem:
             if layout.dof == 0:
                 raise InputError("at least one free variable", "none", "call `add_variables`, or `free` some of them")
             groups = [*self.groups, *held_groups(self.blocks)]
-            system = choose_system(layout, groups, options, self._factor)
-            self._factor = system.analysis
+            system = choose_system(layout, groups, options, self._known)
             model = LeastSquares(layout, groups, system, options.threads, keeps_tangents=not options.examine)
             self._analysed = (key, model, tuple(self.defects()) if options.examine else ())
         return self._analysed[1], self._analysed[2], time.perf_counter() - begin

@@ -15,6 +15,7 @@ from boxplus.sparse.ordering import Method, order
 from boxplus.sparse.supernodes import Fronts, lay_out
 from boxplus.sparse.triangular_solve import solve_many, solve_one
 
+_MOST_KEPT, _SMALL = 8, 1000  # analyses, and variables of a matrix; of larger ones the last alone
 SOLVED_VARIABLES = 8
 """Covariances with up to so many variables are solved for, those with more come from a selected inversion."""
 
@@ -67,6 +68,26 @@ class Analysis:
         )
 
 
+class Analyses:
+    """The last analyses, for problems that change and whose patterns come again, as those of a window do frame by frame."""
+
+    def __init__(self) -> None:
+        self._kept: list[Analysis] = []  # the latest first
+
+    def find(self, pattern: BlockPattern, ordering: Method | NDArray[np.int64], threads: int) -> Analysis | None:
+        """That of this pattern, ordering and number of threads, where it is one of the last."""
+        for k, analysis in enumerate(self._kept):
+            if analysis.holds_for(pattern, ordering, threads):
+                self._kept.insert(0, self._kept.pop(k))
+                return analysis
+        return None
+
+    def keep(self, analysis: Analysis) -> None:
+        """Remember one that was made anew."""
+        most = _MOST_KEPT if len(analysis.pattern.sizes) <= _SMALL else 1
+        self._kept = [analysis, *self._kept][:most]
+
+
 class SparseCholesky:
     """L Lᵀ = P H Pᵀ for symmetric positive definite H with the given pattern.
 
@@ -77,7 +98,8 @@ class SparseCholesky:
         pattern: of H.
         ordering: name of the fill-reducing ordering, or (n,) integers: the variable at each position.
         threads: that factorise subtrees and large fronts side by side; too small a matrix is left to one.
-        analysis: of a matrix before, which is taken over where pattern, ordering and threads are the same.
+        known: analyses of matrices before, one of which is taken over where pattern, ordering and threads are the same; what is
+            analysed anew is added.
 
     Raises:
         InputError: an ordering that is no permutation of the variables, or no thread.
@@ -97,14 +119,17 @@ class SparseCholesky:
         *,
         ordering: Method | NDArray[np.int64] = "auto",
         threads: int = 1,
-        analysis: Analysis | None = None,
+        known: Analyses | None = None,
     ) -> None:
         if threads < 1:
             raise InputError("at least one thread", f"{threads}", "give the number of threads")
         self.pattern = pattern
-        if analysis is None or not analysis.holds_for(pattern, ordering, threads):
+        analysis = None if known is None else known.find(pattern, ordering, threads)
+        if analysis is None:
             method = ordering if isinstance(ordering, str) else None
             analysis = Analysis(pattern, method, threads, _analysed(pattern, ordering, threads))
+            if known is not None and method is not None:
+                known.keep(analysis)
         self.analysis = analysis
         self._fronts = fronts = analysis.fronts
         size = int(pattern.start[-1])

@@ -15,7 +15,7 @@ from boxplus.errors import InputError
 from boxplus.formats.graphs.g2o import read_g2o
 from boxplus.sparse import numeric_factor, subtrees
 from boxplus.sparse.block_matrix import BlockPattern
-from boxplus.sparse.cholesky import NotPositiveDefinite, SparseCholesky
+from boxplus.sparse.cholesky import Analyses, NotPositiveDefinite, SparseCholesky
 
 
 def random_matrix(seed: int, sizes: list[int], pairs: int) -> tuple[BlockPattern, NDArray[np.float64], NDArray[np.float64]]:
@@ -301,16 +301,31 @@ def test_agrees_with_superlu_on_pose_graphs(shared_data: Path, graph: str, threa
 
 def test_an_analysis_is_taken_over_where_it_would_be_the_same() -> None:
     pattern, values, dense = random_matrix(7, [3, 6, 2, 6, 6, 1], 9)
-    first = check(pattern, values, dense)
+    known = Analyses()
+    first = check(pattern, values, dense, known=known)
     twin = BlockPattern(pattern.sizes.copy(), pattern.col_start.copy(), pattern.row.copy())
     other_values, other_dense = positive_definite(twin, np.random.default_rng(8))
-    again = check(twin, other_values, other_dense, analysis=first.analysis)
+    again = check(twin, other_values, other_dense, known=known)
     assert again.analysis is first.analysis
     first.factorize(values)  # the values of the two are apart
     assert np.array_equal(again.solve(other_dense[0]), check(twin, other_values, other_dense).solve(other_dense[0]))
     another, *rest = random_matrix(9, [3, 6, 2, 6, 6, 1], 4)
-    assert check(another, *rest, analysis=first.analysis).analysis is not first.analysis
-    assert SparseCholesky(pattern, threads=2, analysis=first.analysis).analysis is not first.analysis
+    assert check(another, *rest, known=known).analysis is not first.analysis
+    assert SparseCholesky(pattern, threads=2, known=known).analysis is not first.analysis
     order = np.arange(6)
-    given = check(pattern, values, dense, ordering=order[::-1].copy(), analysis=first.analysis)
+    given = check(pattern, values, dense, ordering=order[::-1].copy(), known=known)
     assert given.analysis is not first.analysis
+    assert SparseCholesky(pattern, known=known).analysis is first.analysis  # others came between
+
+
+def test_the_last_analyses_are_kept_and_of_large_matrices_one() -> None:
+    def chain(variables: int) -> BlockPattern:
+        return BlockPattern.from_pairs(np.ones(variables, np.int64), np.arange(1, variables), np.arange(variables - 1))[0]
+
+    known = Analyses()
+    made = [SparseCholesky(chain(3 + k), known=known).analysis for k in range(9)]
+    assert SparseCholesky(chain(4), known=known).analysis is made[1]
+    assert SparseCholesky(chain(3), known=known).analysis is not made[0]  # nine were more than are kept
+    large = SparseCholesky(chain(1001), known=known).analysis
+    assert SparseCholesky(chain(1001), known=known).analysis is large
+    assert SparseCholesky(chain(4), known=known).analysis is not made[1]

@@ -11,19 +11,17 @@ from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.layout import Layout
 from boxplus.optimization.terms.variables import Variables
-from boxplus.sparse.cholesky import Analysis
+from boxplus.sparse.cholesky import Analyses
 
 # Below this many degrees of freedom one dense factorisation is faster than any analysis.
 _DENSE_DOF = 150
 
 
-def choose_system(
-    layout: Layout, groups: Sequence[Group], options: SolverOptions, analysis: Analysis | None = None
-) -> LinearSystem:
+def choose_system(layout: Layout, groups: Sequence[Group], options: SolverOptions, known: Analyses | None = None) -> LinearSystem:
     """The linear system for `options.linear_solver`; `auto` decides, and the system's description says why.
 
     Args:
-        analysis: of a system before, taken over where the matrix to factorise has the same pattern.
+        known: analyses of systems before, one of which is taken over where the matrix to factorise has the same pattern.
 
     Raises:
         InputError: Schur elimination is asked for where no block of variables can be eliminated.
@@ -37,12 +35,12 @@ def choose_system(
                 "none",
                 "let the solver choose, or put the variables to eliminate into a block of their own",
             )
-        return SchurSystem(layout, groups, eliminated, options.threads, analysis)
+        return SchurSystem(layout, groups, eliminated, options.threads, known)
     if wanted == "dense" or (wanted == "auto" and layout.dof <= _DENSE_DOF):
         return DenseSystem(layout, groups, options.threads)
     if wanted == "auto" and eliminated is not None and 2 * _free_dof(layout, eliminated) > layout.dof:
-        return SchurSystem(layout, groups, eliminated, options.threads, analysis)
-    return SparseSystem(layout, groups, options.threads, analysis)
+        return SchurSystem(layout, groups, eliminated, options.threads, known)
+    return SparseSystem(layout, groups, options.threads, known)
 
 
 def _free_dof(layout: Layout, block: Variables) -> int:

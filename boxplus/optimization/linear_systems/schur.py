@@ -35,7 +35,7 @@ from boxplus.optimization.linear_systems.schur_structure import (
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.layout import Layout, connected_numbers
 from boxplus.optimization.terms.variables import Variables
-from boxplus.sparse.cholesky import Analysis, NotPositiveDefinite, SparseCholesky
+from boxplus.sparse.cholesky import Analyses, NotPositiveDefinite, SparseCholesky
 from boxplus.sparse.product_tiles import add_sums, tile_of
 
 
@@ -45,7 +45,7 @@ class SchurSystem(LinearSystem):
     reads_jacobians = True
 
     def __init__(
-        self, layout: Layout, groups: Sequence[Group], eliminated: Variables, threads: int, analysis: Analysis | None = None
+        self, layout: Layout, groups: Sequence[Group], eliminated: Variables, threads: int, known: Analyses | None = None
     ) -> None:
         self._layout, self._threads = layout, threads
         self._rest = layout.without(eliminated)
@@ -63,8 +63,7 @@ class SchurSystem(LinearSystem):
         self._entries = build_entries(layout, self._rest, groups, connected, eliminated, count)
         self._pattern, self._places, self._products = build_products(self._rest, self._equations.pattern, self._entries, count)
         self._values = np.zeros(int(self._pattern.value_start[-1]))
-        self._cholesky = SparseCholesky(self._pattern, threads=threads, analysis=analysis)
-        self.analysis = self._cholesky.analysis
+        self._cholesky = SparseCholesky(self._pattern, threads=threads, known=known)
         self.gradient, self.diagonal = np.zeros(layout.dof), np.zeros(layout.dof)
         self.description = (
             f"Schur elimination of {count} {eliminated.name!r} ({e} degrees of freedom each, no residual connects two of them), "
