@@ -233,11 +233,13 @@ class Preintegration:
                     f"{len(own)} and {len(its)} whose {name} differ, from {max(self.time_ns[0], other.time_ns[0])} ns",
                     "append intervals of the same stream",
                 )
-        both: dict[str, Any] = {
-            name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OF_INTERVALS + _OF_SAMPLES
-        }
-        _, kept = np.unique(both["time_ns"], return_index=True)
-        return replace(self, **both | {name: both[name][kept] for name in _OF_SAMPLES})
+        both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OF_INTERVALS}
+        before = slice(0, int(other.time_ns.searchsorted(self.time_ns[0])))
+        after = slice(int(other.time_ns.searchsorted(self.time_ns[-1], side="right")), None)
+        for name in _OF_SAMPLES:
+            its = getattr(other, name)
+            both[name] = np.concatenate([its[before], getattr(self, name), its[after]])
+        return replace(self, **both)
 
     def merge(self, first: int, last: int | None = None) -> Preintegration:
         """With the intervals `first` to `last` (by default the next one) as one, integrated anew from the samples.
@@ -259,8 +261,9 @@ class Preintegration:
                 f"interval {k + 1} from {self.intervals_ns[k + 1, 0]} ns, interval {k} to {self.intervals_ns[k, 1]} ns",
                 "merge neighbours in time",
             )
-        gone = np.arange(first + 1, end + 1)
-        result = self._with_intervals(lambda array: np.delete(array, gone, axis=0))
+        kept = np.ones(len(self), dtype=np.bool_)
+        kept[first + 1 : end + 1] = False
+        result = self._with_intervals(lambda array: array[kept])
         result.intervals_ns[first, 1] = self.intervals_ns[end, 1]
         result._integrate(np.array([first], dtype=np.uint32))
         return result
