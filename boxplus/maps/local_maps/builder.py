@@ -14,6 +14,7 @@ from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.se3 import SE3
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import Floats, LocalMap, checked_covariance, drift_covariance, relative_covariance
+from boxplus.maps.local_maps.vertical import find_vertical
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -25,7 +26,7 @@ class _Seen:
     time_ns: int
     T_odo_body: Floats
     covariance: Floats
-    up_odo: Floats
+    up_odo: Floats | None
     path_m: float
     p_body: NDArray[np.float32]
 
@@ -49,10 +50,11 @@ class LocalMapBuilder:
         self._seen: list[_Seen] = []
         self._last: _Seen | None = None  # the scan that the frame of the last map stands at
         self._T_odo_before: Floats | None = None
+        self._found_up: Floats | None = None  # where nobody said it
         self._count = 0
 
     def push(
-        self, time_ns: int, T_odo_body: ArrayLike, covariance: ArrayLike, p_body: ArrayLike, up_odo: ArrayLike = _UP
+        self, time_ns: int, T_odo_body: ArrayLike, covariance: ArrayLike, p_body: ArrayLike, up_odo: ArrayLike | None = _UP
     ) -> list[LocalMap]:
         """Take a scan; returns the map that it completes, if it does.
 
@@ -61,15 +63,14 @@ class LocalMapBuilder:
             T_odo_body: (7,) pose of the body in the odometry's world [qw, qx, qy, qz, x, y, z].
             covariance: (6, 6) of [w, v] [rad, m] on the right of that pose, against the first pose.
             p_body: (N, 3) its points in the body's frame [m]; none where nobody knows where they belong.
-            up_odo: (3,) against gravity, in the odometry's world.
+            up_odo: (3,) against gravity, in the odometry's world. None where nobody knows: surfaces of the first map tell it,
+                within 45° of the z axis of the body there, and the odometry carries it on.
 
         Raises:
             InputError: a time that is not later, arrays of another shape, not finite.
         """
         pose = SE3.check("T_odo_body", np.atleast_2d(as_floats(T_odo_body, "T_odo_body")))[0]
-        up = as_floats(up_odo, "up_odo")
-        if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0.0:
-            raise InputError("up_odo as a direction (3,)", f"{up.tolist()}", "give minus gravity, in the odometry's world")
+        up = None if up_odo is None else _direction(up_odo)
         points = np.asarray(p_body, dtype=np.float32)
         if points.ndim != 2 or points.shape[1] != 3:
             raise InputError("p_body of shape (N, 3)", f"shape {points.shape}", "give points in the body's frame [m]")
@@ -80,7 +81,7 @@ class LocalMapBuilder:
         path = 0.0 if newest is None else newest.path_m + step
         kept = self._thinned(points)
         own = checked_covariance("covariance", covariance)
-        self._seen.append(_Seen(int(time_ns), pose, own, up / np.linalg.norm(up), path, kept))
+        self._seen.append(_Seen(int(time_ns), pose, own, up, path, kept))
         first = self._seen[0]
         way, time_s = path - first.path_m, (time_ns - first.time_ns) * 1e-9
         is_long = way >= self.config.length or (time_s >= self.config.duration and way >= self.config.least_length)
@@ -99,7 +100,7 @@ class LocalMapBuilder:
         """The map of the collected scans; the last of them begins the next one."""
         path = np.array([seen.path_m for seen in self._seen])
         middle = self._seen[int(np.argmin(np.abs(path - 0.5 * (path[0] + path[-1]))))]
-        T_odo_map = _level_frame(middle)
+        T_odo_map = _level_frame(middle.T_odo_body, self._up_odo(middle))
         points = np.concatenate([self._in_map(seen, T_odo_map) for seen in self._seen])
         points = points[first_per_voxel(points, self.config.voxel)]
         begin = self._seen[0].time_ns
@@ -121,6 +122,17 @@ class LocalMapBuilder:
         self._seen = [replace(newest, p_body=newest.p_body[:0])]
         return made
 
+    def _up_odo(self, middle: _Seen) -> Floats:
+        """(3,) as it was said, or as the collected scans show it."""
+        if middle.up_odo is not None:
+            return middle.up_odo
+        if self._found_up is None:
+            here = middle.T_odo_body  # in whose frame coordinates are small
+            points = np.concatenate([self._in_map(seen, here) for seen in self._seen])
+            points = np.ascontiguousarray(points[first_per_voxel(points, self.config.voxel)])
+            self._found_up = quaternion.to_matrix(here[:4]) @ find_vertical(points, _UP)
+        return self._found_up
+
     @staticmethod
     def _in_map(seen: _Seen, T_odo_map: Floats) -> NDArray[np.float32]:
         T = se3.compose(se3.inverse(T_odo_map), seen.T_odo_body)
@@ -138,16 +150,23 @@ class LocalMapBuilder:
         return own + drift
 
 
-def _level_frame(seen: _Seen) -> Floats:
+def _direction(up_odo: ArrayLike) -> Floats:
+    up = as_floats(up_odo, "up_odo")
+    if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0.0:
+        raise InputError("up_odo as a direction (3,)", f"{up.tolist()}", "give minus gravity, in the odometry's world")
+    return np.asarray(up / np.linalg.norm(up))
+
+
+def _level_frame(T_odo_body: Floats, z: Floats) -> Floats:
     """(7,) frame at a body's position with z up and x ahead of it."""
-    R_odo_body, z = quaternion.to_matrix(seen.T_odo_body[:4]), seen.up_odo
+    R_odo_body = quaternion.to_matrix(T_odo_body[:4])
     x = R_odo_body[:, 0] - z * (z @ R_odo_body[:, 0])
     if np.linalg.norm(x) < _LEAST_AHEAD:
         y = R_odo_body[:, 1] - z * (z @ R_odo_body[:, 1])
         x = np.cross(y, z)
     x /= np.linalg.norm(x)
     R = np.stack([x, np.cross(z, x), z], axis=1)
-    return np.concatenate([quaternion.from_matrix(R), seen.T_odo_body[4:]])
+    return np.concatenate([quaternion.from_matrix(R), T_odo_body[4:]])
 
 
 def _moved(covariance: Floats, T_map_body: Floats) -> Floats:

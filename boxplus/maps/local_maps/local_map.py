@@ -20,8 +20,9 @@ Floats = NDArray[np.float64]
 class LocalMap:
     """What was seen on a stretch of odometry.
 
-    Its frame `map` stands where the middle of the stretch was, z up along gravity, x ahead of the body. The middle rather than
-    the beginning: the odometry drifts within a local map too, and half of its points then lie on either side.
+    Its frame `map` stands where the middle of the stretch was, z up (against gravity; without an IMU as surfaces show it),
+    x ahead of the body. The middle rather than the beginning: the odometry drifts within a local map too, and half of its points
+    then lie on either side.
 
     Attributes:
         number: 0, 1, … in the order of time.

@@ -115,6 +115,11 @@ def meet_runs(store: str, names: tuple[str, str], numbers: tuple[int, int], conf
 def _run(folder: Path, recording: str, config: SlamRunConfig) -> SlamSummary:
     own = SlamFolder(folder)
     with open_recording(recording, config.recording) as opened:
+        if not opened.info.imu_topic:
+            raise InputError(
+                "a recording with an IMU, which tells where down is", f"a LiDAR alone in {opened.info.path.name}",
+                "leave it out of the fleet; 'boxplus slam' takes it by itself",
+            )  # fmt: skip
         try:
             return run_slam(opened, own.path, config, resume=_is_begun(own, config)).summary
         except InputError:  # a checkpoint that cannot be taken up, or another run's results

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from boxplus._arguments import as_settings
-from boxplus.errors import InputError, printable
+from boxplus.errors import printable
 from boxplus.formats.output import atomic_file
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.manifolds import quaternion, se3
@@ -69,16 +69,13 @@ def run_localization(
         extrinsic, overwrite, progress, view, should_stop: as for `run_odometry`.
 
     Raises:
-        InputError: the recording has no IMU; what `run_odometry` refuses.
+        InputError: what `run_odometry` refuses.
         OutputError: the folder cannot be written or the disk is full.
         RecordingError: nothing could be read.
     """
-    if not recording.info.imu_topic:
-        raise InputError(
-            "a recording with an IMU, which tells where down is", f"a LiDAR alone in {recording.info.path.name}",
-            "localise recordings with an IMU",
-        )  # fmt: skip
     config = as_settings(LocalizationRunConfig, config)
+    if not recording.info.imu_topic:
+        config.odometry.of_lidar_alone()  # refuses what it refuses before anything is written
     claimed = (
         nullcontext(folder) if isinstance(folder, LocalizationFolder) else claim_localization_folder(folder, overwrite=overwrite)
     )
@@ -88,7 +85,7 @@ def run_localization(
             file.write(dump_localization_config(config).encode())
         began = time.perf_counter()
         localizer = Localizer(saved, config.localization)
-        beside = _Beside(localizer, own, stack, view)
+        beside = _Beside(localizer, own, stack, view, has_gravity=bool(recording.info.imu_topic))
         beside.search_s = time.perf_counter() - began
         odometry = run_odometry(
             recording, own.odometry.path, config.of_odometry(), extrinsic=extrinsic, overwrite=overwrite, progress=progress,
@@ -102,8 +99,10 @@ def run_localization(
 class _Beside:
     """Sees every estimate of the odometry, and writes where it is in the map."""
 
-    def __init__(self, localizer: Localizer, folder: LocalizationFolder, stack: ExitStack, view: View | None) -> None:
-        self.localizer = localizer
+    def __init__(
+        self, localizer: Localizer, folder: LocalizationFolder, stack: ExitStack, view: View | None, *, has_gravity: bool
+    ) -> None:
+        self.localizer, self._has_gravity = localizer, has_gravity
         self._view = view
         self._trajectory = stack.enter_context(TrajectoryWriter(folder.path))
         self._log = stack.enter_context(LocalizationLog(folder.log))
@@ -123,9 +122,9 @@ class _Beside:
         T_odo_imu = np.concatenate([quaternion.from_matrix(state.R_world_imu), state.p_world_imu])
         R, t = state.R_imu_lidar.astype(np.float32), state.p_imu_lidar.astype(np.float32)
         lost_before = self.localizer.losses
-        found = self.localizer.push(
-            estimate.time_ns, T_odo_imu, estimate.p_lidar @ R.T + t, -state.gravity_world, lost=estimate.status == "lost"
-        )
+        up = -state.gravity_world if self._has_gravity else None
+        p_imu = estimate.p_lidar @ R.T + t
+        found = self.localizer.push(estimate.time_ns, T_odo_imu, p_imu, up, lost=estimate.status == "lost")
         self.first_ns = estimate.time_ns if self.first_ns is None else self.first_ns
         if self.localizer.losses > lost_before:
             self.losses.append(f"{(estimate.time_ns - self.first_ns) * 1e-9:.1f} s: {self.localizer.lost_because}")

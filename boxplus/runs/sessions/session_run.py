@@ -115,6 +115,11 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
     summary = read_slam_summary(own.summary)
     if summary.state != "finished":
         raise InputError("a run that came to its end", f"{own.path}: {summary.describe_state()}", "go on with it: --resume")
+    odometry = read_summary(own.odometry.summary)
+    if not odometry.has_imu:
+        raise InputError(
+            "runs with an IMU, which tells where down is in each of them", f"one of a LiDAR alone in {own.path}", "leave it out"
+        )
     if needs_scans and not own.spool.is_file():
         raise InputError("a run that kept its scans", f"no {own.spool.name} in {own.path}", _ADVICE)
     if needs_scans and summary.spool_bytes is not None and (size := own.spool.stat().st_size) != summary.spool_bytes:
@@ -128,7 +133,6 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
     if needs_scans:
         _refuse_cut_trajectory(own, max(local_map.end_ns for local_map in stored_maps))
     loops = [OwnLoop(loop.query, loop.place, loop.information) for loop in outcome.accepted]
-    odometry = read_summary(own.odometry.summary)
     extrinsic = odometry.extrinsic
     T_imu_lidar = np.array(extrinsic.T_imu_lidar_end or extrinsic.T_imu_lidar_start)
     session = Session.of(name, maps, placed.T_map, loops)

@@ -35,15 +35,23 @@ class Beside:
 
     Args:
         config: how local maps are cut; maps: where they go.
+        has_gravity: the odometry knows where down is; without an IMU the surfaces have to tell.
         spool: where scans go; None keeps none.
         search: told of every local map.
         view: shown loops; None shows none.
     """
 
     def __init__(
-        self, config: LocalMapConfig, maps: LocalMapFolder, spool: ScanSpool | None, search: LoopSearch, view: LoopView | None
+        self,
+        config: LocalMapConfig,
+        maps: LocalMapFolder,
+        spool: ScanSpool | None,
+        search: LoopSearch,
+        view: LoopView | None,
+        *,
+        has_gravity: bool = True,
     ) -> None:
-        self._builder = LocalMapBuilder(config)
+        self._builder, self._has_gravity = LocalMapBuilder(config), has_gravity
         self._maps, self._spool, self._search, self._view = maps, spool, search, view
         self._count = 0
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="boxplus-local-maps")
@@ -79,7 +87,8 @@ class Beside:
         if estimate.status == "lost":  # nobody knows where its points belong
             p_imu = p_imu[:0]
         covariance = turn @ estimate.pose_covariance @ turn.T
-        made = self._builder.push(estimate.time_ns, T_odo_imu, 0.5 * (covariance + covariance.T), p_imu, -state.gravity_world)
+        up = -state.gravity_world if self._has_gravity else None
+        made = self._builder.push(estimate.time_ns, T_odo_imu, 0.5 * (covariance + covariance.T), p_imu, up)
         if self._spool is not None and len(p_imu):
             self._spool.append(SpooledScan(estimate.time_ns, T_odo_imu, p_imu, estimate.intensity))
         self._take(made)

@@ -79,28 +79,26 @@ def run_slam(
         extrinsic, overwrite, resume, progress, view, should_stop: as for `run_odometry`.
 
     Raises:
-        InputError: the recording has no IMU; OpenCV, the extra `vision`, is not installed and density images are wanted; what
-            `run_odometry` and `Slam` refuse; nothing to resume.
+        InputError: OpenCV, the extra `vision`, is not installed and density images are wanted; what `run_odometry` and `Slam`
+            refuse; nothing to resume.
         OutputError: the folder cannot be written or the disk is full.
         RecordingError: nothing could be read.
         BoxplusError: the process that looks for loops came to an end.
     """
-    if not recording.info.imu_topic:
-        raise InputError(
-            "a recording with an IMU, which tells where down is", f"a LiDAR alone in {recording.info.path.name}",
-            "run 'boxplus lio': it closes no loops, and needs no IMU",
-        )  # fmt: skip
     config = as_settings(SlamRunConfig, config)
     if config.gnss.utm:
         require_utm()
     Slam(config.slam, forbidden=forbidden or (), forced=forced or ())  # refuses what it refuses before the odometry has run
+    if not recording.info.imu_topic:
+        config.odometry.of_lidar_alone()  # as does this
     if isinstance(folder, SlamFolder):
         claimed = nullcontext(folder)
     else:
         claimed = claim_slam_folder(folder, overwrite=overwrite, resume=resume)  # type: ignore[assignment]
     with claimed as own:
         run = _Run(recording, own, config, resume, (forbidden or [], forced or []))
-        search = LoopSearch(config.slam, forbidden or [], forced or [], make_folder(own.local_maps), own.graph)
+        own_slam = config.slam if recording.info.imu_topic else config.slam.without_gravity()
+        search = LoopSearch(own_slam, forbidden or [], forced or [], make_folder(own.local_maps), own.graph)
         return run.execute(search, extrinsic, progress or (lambda _: None), view, loop_view, should_stop or (lambda: False))
 
 
@@ -112,6 +110,7 @@ class _Run:
     ) -> None:
         self._recording, self._folder, self._config, self._resume = recording, folder, config, resume
         self._decided = decided  # forbidden and forced
+        self._has_imu = bool(recording.info.imu_topic)
         self._started, self._resumed = datetime.now(UTC), 0
         text = dump_slam_config(config)
         if resume:
@@ -138,7 +137,9 @@ class _Run:
         try:
             with (
                 search,
-                closing(Beside(config.local_maps, LocalMapFolder(own.local_maps), spool, search, loop_view)) as beside,
+                closing(
+                    Beside(config.local_maps, LocalMapFolder(own.local_maps), spool, search, loop_view, has_gravity=self._has_imu)
+                ) as beside,
             ):
                 if self._resume and own.odometry_is_finished():
                     odometry = self._finished_odometry(beside)
@@ -184,8 +185,14 @@ class _Run:
     def _write(self, odometry: RunSummary, outcome: SlamOutcome, spool: ScanSpool | None, slam_s: float) -> SlamResult:
         own, config = self._folder, self._config
         began = time.perf_counter()
-        outcome, earth = lay_onto_earth(self._recording, own, outcome, config)
+        if self._has_imu:
+            outcome, earth = lay_onto_earth(self._recording, own, outcome, config)
+        else:
+            outcome, earth = outcome.upright(), None
+            write_graph(own.graph, outcome)
         correction, gnss, told = outcome.correction, None, [] if outcome.accepted else [LEFT_IN_PLACE]
+        if not self._has_imu:
+            told += _told_without_imu(outcome, self._recording.info.gnss_topic)
         told += pairs_without_maps(*self._decided, len(correction.time_ns))
         doubt = odometry.contradiction or outcome.doubt
         write_corrected_trajectory(own, outcome.placed, is_closed=bool(outcome.accepted))
@@ -246,6 +253,17 @@ def _checked_to_go_on(folder: SlamFolder, config: str) -> int:
             f"give --config {folder.config}, or start a new run in another folder",
         )  # fmt: skip
     return 1 + (read_slam_summary(folder.summary).resumed if folder.summary.is_file() else 0)
+
+
+def _told_without_imu(outcome: SlamOutcome, gnss_topic: str) -> list[str]:
+    tilt = np.degrees(2.0 * np.arccos(np.clip(outcome.T_world_map[0], -1.0, 1.0)))
+    told = [
+        "no IMU tells where down is: surfaces of the first local map do; trajectory and map are turned upright, by "
+        f"{tilt:.1f}° from where the LiDAR began"
+    ]
+    if gnss_topic:
+        told.append("the positions by satellite are not used: that takes an IMU, which tells where down is")
+    return told
 
 
 def _waiting(search: LoopSearch) -> Progress:

@@ -128,7 +128,13 @@ class Localizer:
         return "; ".join(text for text in (self.stays.doubt, self.lengths.doubt) if text) or None
 
     def push(
-        self, time_ns: int, T_odo_body: ArrayLike, p_body: ArrayLike, up_odo: ArrayLike = (0.0, 0.0, 1.0), *, lost: bool = False
+        self,
+        time_ns: int,
+        T_odo_body: ArrayLike,
+        p_body: ArrayLike,
+        up_odo: ArrayLike | None = (0.0, 0.0, 1.0),
+        *,
+        lost: bool = False,
     ) -> Localization:
         """Take a scan.
 
@@ -136,7 +142,8 @@ class Localizer:
             time_ns: absolute [ns], later than the one before.
             T_odo_body: (7,) pose of the body in the odometry's world.
             p_body: (N, 3) its points in the body's frame [m].
-            up_odo: (3,) against gravity, in the odometry's world.
+            up_odo: (3,) against gravity, in the odometry's world. None where nobody knows: while it is searched, surfaces tell,
+                within 45° of the body's z axis; then the map does.
             lost: the odometry does not know where this scan belongs.
 
         Raises:
@@ -158,13 +165,13 @@ class Localizer:
         self._before = int(time_ns), T_odo
         self.stays.walk(float(np.linalg.norm(step[4:])))
         self.lengths.walk(float(np.linalg.norm(step[4:])))
-        up = as_floats(up_odo, "up_odo")
+        up = None if up_odo is None else as_floats(up_odo, "up_odo")
         if self._tracker is None:
             return self._search(int(time_ns), T_odo, points[:0] if lost else points, up)
         self._tracker.predict(step, seconds)
         return self._follow(self._tracker, int(time_ns), T_odo, points, up, lost)
 
-    def _search(self, time_ns: int, T_odo: Floats, points: NDArray[np.float32], up: Floats) -> Localization:
+    def _search(self, time_ns: int, T_odo: Floats, points: NDArray[np.float32], up: Floats | None) -> Localization:
         """Collect scans; look for what has been collected."""
         search = None
         for query in self._builder.push(time_ns, T_odo, np.zeros((6, 6)), points, up):
@@ -241,7 +248,7 @@ class Localizer:
         return same_pose(se3.compose(first, T_odo), se3.compose(second, T_odo), *_AGREE)
 
     def _follow(
-        self, tracker: Tracker, time_ns: int, T_odo: Floats, points: NDArray[np.float32], up: Floats, lost: bool
+        self, tracker: Tracker, time_ns: int, T_odo: Floats, points: NDArray[np.float32], up: Floats | None, lost: bool
     ) -> Localization:
         config = self.config
         matched = None
@@ -249,7 +256,7 @@ class Localizer:
         if not lost and len(points) and (time_ns - self._tried_ns) * 1e-9 >= config.track_interval:
             self._tried_ns = time_ns
             is_due = self.lengths.is_due
-            matched = tracker.correct(points, _level(T_odo, up), with_lengths=is_due)
+            matched = tracker.correct(points, _level(T_odo, up, tracker.T_map_body), with_lengths=is_due)
             self._failures = self._failures + 1 if matched.innovation > matched.limit else 0
             if is_due and matched.measured:
                 self.lengths.see(matched.lengths)
@@ -269,7 +276,7 @@ class Localizer:
         return Localization(time_ns, status, tracker.T_map_body, tracker.covariance, matched, search)
 
     def _look_again(
-        self, tracker: Tracker, time_ns: int, T_odo: Floats, points: NDArray[np.float32], up: Floats
+        self, tracker: Tracker, time_ns: int, T_odo: Floats, points: NDArray[np.float32], up: Floats | None
     ) -> Search | None:
         """Now and then look for what is seen in the whole map, as if nothing were known, and ask whether that is here."""
         config = self.config
@@ -342,9 +349,12 @@ class Localizer:
         )
 
 
-def _level(T_odo_body: Floats, up_odo: Floats) -> Floats:
-    """(3, 3) to a frame whose z is up, whatever its x."""
-    z = quaternion.to_matrix(T_odo_body[:4]).T @ (up_odo / np.linalg.norm(up_odo))
+def _level(T_odo_body: Floats, up_odo: Floats | None, T_map_body: Floats) -> Floats:
+    """(3, 3) to a frame whose z is up, whatever its x: as the odometry has it, or the map, which stands upright."""
+    if up_odo is None:
+        z = quaternion.to_matrix(T_map_body[:4])[2]
+    else:
+        z = quaternion.to_matrix(T_odo_body[:4]).T @ (up_odo / np.linalg.norm(up_odo))
     x = np.eye(3)[int(np.argmin(np.abs(z)))]
     x = x - z * (z @ x)
     x /= np.linalg.norm(x)

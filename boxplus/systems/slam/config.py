@@ -57,3 +57,10 @@ class SlamConfig(Settings):
     rival_distance: float = Field(1.5, gt=0, description="as good a fit this far away makes a loop ambiguous [m]")
     rival_fit: float = Field(0.95, gt=0, le=1, description="as good: with this share of the points that fit")
     gravity_sigma: float = Field(0.005, gt=0, description="standard deviation of the vertical of a local map [rad]")
+
+    def without_gravity(self) -> SlamConfig:
+        """Those for an odometry without an IMU: what was taken for its vertical holds no local map upright.
+
+        A radian beside the milliradians by which an odometry turns from map to map.
+        """
+        return self.model_copy(update={"gravity_sigma": 1.0})

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from boxplus.manifolds import se3
+from boxplus.manifolds import quaternion, se3
 from boxplus.systems.slam.correction import Correction
 from boxplus.systems.slam.graph import MapGraph
 from boxplus.systems.slam.loop import Floats, Loop
@@ -22,7 +22,7 @@ class SlamOutcome:
         doubt: a sentence where loops contradict the odometry, see `Slam.doubt`.
         drift_scale: factor of the odometry's covariances in the graph.
         T_world_map: (7,) the frame of `correction.T_map` in that of trajectory and map: another one where the map was laid onto
-            the Earth.
+            the Earth, or set upright.
     """
 
     correction: Correction
@@ -40,6 +40,17 @@ class SlamOutcome:
     def placed(self) -> Correction:
         """The correction to the frame of trajectory and map."""
         return replace(self.correction, T_map=se3.compose(self.T_world_map, self.correction.T_map))
+
+    def upright(self) -> SlamOutcome:
+        """The same with trajectory and map turned about their origin, the shortest way, until the first local map is level.
+
+        For an odometry without an IMU, whose world stands as its LiDAR did.
+        """
+        x, y, z = quaternion.to_matrix(self.correction.T_map[0, :4])[:, 2]
+        half = np.sqrt(np.clip([0.5 * (1.0 + z), 0.5 * (1.0 - z)], 0.0, 1.0))  # cosine and sine of half the angle to (0, 0, 1)
+        level = np.hypot(x, y)
+        axis = np.array([y, -x]) / level if level > 0.0 else np.array([1.0, 0.0])
+        return replace(self, T_world_map=np.array([half[0], *(half[1] * axis), 0.0, 0.0, 0.0, 0.0]))
 
     def laid(self, T_map: Floats, T_enu_map: Floats) -> SlamOutcome:
         """The same with local maps (n, 7) where positions by satellite put them, and the map's frame in ENU (7,)."""

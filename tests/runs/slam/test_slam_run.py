@@ -18,11 +18,13 @@ import yaml
 from boxplus.errors import InputError
 from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import Trajectory, read_trajectory
+from boxplus.manifolds import quaternion
 from boxplus.recordings.recording import Recording
 from boxplus.report import load_report, write_report
 from boxplus.report.slam_page import write_slam_report
 from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.runs.run_facts import WarningFacts
+from boxplus.runs.sessions.session_run import open_session_run
 from boxplus.runs.slam.config import load_slam_config
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
 from boxplus.runs.slam.loop_file import pairs_without_maps, read_loop_decisions
@@ -34,7 +36,7 @@ from boxplus.simulation import SpinningLidar
 from boxplus.simulation.gnss import GnssConfig
 from boxplus.simulation.live_recording import GNSS_ORIGIN, as_recording
 from boxplus.simulation.motions import trajectories
-from boxplus.simulation.scenarios import make_scenario
+from boxplus.simulation.scenarios import make_scenario, mounting
 from boxplus.simulation.simulation import Simulation
 from boxplus.simulation.worlds.worlds import city
 from boxplus.systems.slam.slam import Slam
@@ -318,8 +320,38 @@ def test_a_spool_goes_on_from_a_mark_with_the_same_bytes(tmp_path: Path) -> None
         ScanSpool(tmp_path / "new", 0.3).cut(mark)
 
 
-def test_a_lidar_alone_is_refused(tmp_path: Path) -> None:
+def test_a_lidar_alone_closes_loops_and_its_map_stands_upright(tmp_path: Path) -> None:
+    """Nobody says where down is, and the LiDAR leans forward by 15°: surfaces tell."""
+    lidar = SpinningLidar(channels=16, azimuth_steps=360, vertical_fov_deg=(-25.0, 15.0))
+    leaning = replace(round_a_block().scenario, lidar=lidar, T_imu_lidar=mounting(-1.0, 15.0, 5.0, (0.6, 0.1, 0.4)))
+    simulation = Simulation(leaning, seed=3)
+    recording = as_recording(simulation, gnss=RECEIVER)
+    recording.info.imu_topic = ""  # its samples still come: none may take part
+    summary = run_slam(recording, tmp_path / "out", load_slam_config(settings=SETTINGS)).summary
+    assert summary.state == "finished" and summary.contradiction is None and summary.gnss is None
+    assert summary.loops_accepted >= 3 and summary.local_maps > 10
+    upright, no_fixes = summary.warnings
+    assert re.search(r"no IMU tells where down is: .* turned upright, by 15\.\d° from where the LiDAR began", upright)
+    assert "positions by satellite are not used" in no_fixes
+    folder = SlamFolder(tmp_path / "out")
+    trajectory, odometry = read_trajectory(folder.trajectory), read_trajectory(folder.odometry.trajectory)
+    truth = simulation.ground_truth(trajectory.times)
+    p_world_lidar = truth.p_world_imu + truth.R_world_imu @ simulation.T_imu_lidar[:3, 3]
+    before, after = (ate(found.p, p_world_lidar) for found in (odometry, trajectory))
+    assert after < 0.02 and after < 1.1 * before
+    up_lidar = np.swapaxes(truth.R_world_imu @ simulation.T_imu_lidar[:3, :3], 1, 2)[:, :, 2]
+    worlds = [quaternion.to_matrix(found.q_wxyz) for found in (odometry, trajectory)]
+    lean = [np.degrees(np.arccos((R @ up_lidar[..., None])[:, 2, 0])) for R in worlds]
+    assert lean[0].min() > 14.0 and lean[1].max() < 0.3
+    report = unescape(write_report(load_slam_result(folder.path)).read_text(encoding="utf-8"))
+    assert "no IMU tells where down is" in report
+    with pytest.raises(InputError, match=r"runs with an IMU, .* – got one of a LiDAR alone"):
+        open_session_run(folder.path, "monday", needs_scans=False)
+
+
+def test_settings_of_an_imu_are_refused_without_one_and_leave_no_folder(tmp_path: Path) -> None:
     recording = block()
     recording.info.imu_topic = ""
-    with pytest.raises(InputError, match="which tells where down is – got a LiDAR alone"):
-        run_slam(recording, tmp_path / "out")
+    with pytest.raises(InputError, match="settings of a LiDAR alone – got gyro_noise"):
+        run_slam(recording, tmp_path / "out", load_slam_config(settings=["odometry.gyro_noise=0.01"]))
+    assert not (tmp_path / "out").exists()

@@ -55,9 +55,15 @@ def own_world(drive: DriftingDrive, yaw: float = 2.0) -> NDArray[np.float64]:
     return se3.compose(T_own, drive.T_odo_body)
 
 
-def push_all(localizer: Localizer, drive: DriftingDrive, T_odo: NDArray[np.float64], begin_ns: int = 0) -> list[Localization]:
+def push_all(
+    localizer: Localizer,
+    drive: DriftingDrive,
+    T_odo: NDArray[np.float64],
+    begin_ns: int = 0,
+    up_odo: ArrayLike | None = (0.0, 0.0, 1.0),
+) -> list[Localization]:
     rows = zip(drive.time_ns.tolist(), T_odo, drive.scans, strict=True)
-    return [localizer.push(begin_ns + time_ns, T, scan) for time_ns, T, scan in rows]
+    return [localizer.push(begin_ns + time_ns, T, scan, up_odo) for time_ns, T, scan in rows]
 
 
 def errors(found: list[Localization], drive: DriftingDrive) -> NDArray[np.float64]:
