@@ -104,9 +104,11 @@ def slam(
     from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
-    from boxplus.runs.slam.folder import claim_slam_folder
+    from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
     from boxplus.runs.slam.slam_run import run_slam
 
+    if resume and not overwrite and SlamFolder(folder).stopped_before_its_first_checkpoint():
+        resume, overwrite = False, True
     terminal = RunTerminal(quiet=quiet, as_json=as_json)
     with reported(recording, folder, as_json=as_json) as outcome:
         truth = read_ground_truth(ground_truth)

@@ -75,5 +75,7 @@ def candidate_texts(search: Search, count: int = 5) -> list[str]:
     for c in search.candidates[:count]:
         x, y, z = c.T_map_query[4:]
         why = c.refusal or search.verdict or "believed"
-        found.append(f"({x:.1f}, {y:.1f}, {z:.1f}) m, near local map {c.place}: {100 * c.fit:.0f} % of what stands fits; {why}")
+        share = f"{100 * c.fit:.0f} % of what stands"
+        text = why if why.startswith(share) else f"{share} fits; {why}"
+        found.append(f"({x:.1f}, {y:.1f}, {z:.1f}) m, near local map {c.place}: {text}")
     return found

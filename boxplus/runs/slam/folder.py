@@ -14,7 +14,7 @@ from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.runs.run_folder import RunFolder, is_map_file
 from boxplus.runs.slam.summary import read_slam_summary
 from boxplus.runs.storage.folder_lock import locked_folder
-from boxplus.runs.storage.output_folder import output_folder, refuse_both
+from boxplus.runs.storage.output_folder import output_folder, program_of, refuse_both, state_of
 
 PROGRAM = "boxplus slam"
 _LOCAL_MAP_FILE = re.compile(r"(\d{6,}|graph)\.npz")
@@ -86,6 +86,12 @@ class SlamFolder(RunFolder):
             return read_summary(self.odometry.summary).state == "finished"
         except InputError:
             return False
+
+    def stopped_before_its_first_checkpoint(self) -> bool:
+        """Whether a run of `boxplus slam` was begun here, is not finished, and left nothing that one could go on from."""
+        if self.odometry.checkpoint.is_file() or self.odometry_is_finished():
+            return False
+        return self.summary.is_file() and program_of(self.summary) == PROGRAM and state_of(self.summary) != "finished"
 
     def own_files(self) -> Iterator[Path]:
         """See `RunFolder.own_files`."""
