@@ -99,6 +99,9 @@ BENCHMARKS = {
     "vio": Benchmark(("--only", "mh01")),
     "vio_runs": Benchmark(("--only", "mh01", "--modes", "stereo")),
     "vio_nees": Benchmark(("--seeds", "500:502", "--seconds", "4")),
+    "slam": Benchmark(
+        ("--places", "10", "30", "--maps", "100", "--loops", "5", "--recordings", "block", "--rounds", "1"),
+    ),
     "closure_nees": Benchmark(("--seeds", "1:5:2", "--only", "block,sessions_city")),
     "vio_start": Benchmark(("--seeds", "2001:2021"), arguments=("--half", "odd", "--seeds", "1:1001")),
     "fleet": Benchmark(("--recordings", "3", "4", "--index", "200", "400")),

@@ -26,6 +26,7 @@ from boxplus.systems.slam.loop import Floats, Loop
 _LOOPS = "loops"
 _INLIER = 0.999  # of true loops within the threshold
 _DAMPING = 1e-9
+_NARROWING = 2.0  # from width to width: what is graduated has been held against each other before, and 1.4 takes twice as long
 _VERTICAL_LENGTH = 100.0  # m of way over which the verticals of local maps are one measurement
 
 
@@ -153,6 +154,7 @@ def close_graph(
             loss="truncated",
             inlier_threshold=_threshold(int(dof.max())),
             weights={_LOOPS: np.zeros(len(dof))},
+            narrowing=_NARROWING,
             options=options,
         )
         group.set_loss(Squared())

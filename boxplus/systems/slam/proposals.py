@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,11 +50,11 @@ class Proposer:
         if config.appearance == "density":
             require("cv2", "which describes density images")  # now, not after the first local map
 
-    def propose(self, query: int, maps: Maps, before: int, odometry: OdometryChain, T_map: Sequence[Floats]) -> list[Proposal]:
+    def propose(self, query: int, maps: Maps, before: int, odometry: OdometryChain, T_map: Floats) -> list[Proposal]:
         """Places before number `before` for the newest map, number `query`, which is remembered for later ones.
 
         Args:
-            maps: gives a map by its number; T_map: (7,) of each, as estimated now.
+            maps: gives a map by its number; T_map: (query + 1, 7) of each, as estimated now.
         """
         found: list[Proposal] = []
         if self._config.appearance == "density":
@@ -95,13 +95,13 @@ def seen(candidate: Candidate) -> Proposal:
     return Proposal(candidate.place, T, "appearance", candidate.inliers)
 
 
-def _near(query: int, odometry: OdometryChain, before: int, T_map: Sequence[Floats], config: SlamConfig) -> list[Proposal]:
+def _near(query: int, odometry: OdometryChain, before: int, T_map: Floats, config: SlamConfig) -> list[Proposal]:
     """The nearest places, no two of them neighbours along the way, where one knows well enough where one is."""
-    positions = np.stack(T_map[:before])[:, 4:]
-    distance = np.linalg.norm(positions - T_map[query][4:], axis=1)
+    distance = np.linalg.norm(T_map[:before, 4:] - T_map[query, 4:], axis=1)
+    near = np.flatnonzero(distance <= config.nearby)
     found: list[Proposal] = []
-    for place in np.argsort(distance, kind="stable").tolist():
-        if len(found) >= config.nearby_count or distance[place] > config.nearby:
+    for place in near[np.argsort(distance[near], kind="stable")].tolist():
+        if len(found) >= config.nearby_count:
             break
         if any(abs(place - other.place) <= 1 for other in found):
             continue

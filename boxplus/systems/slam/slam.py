@@ -9,6 +9,7 @@ corrected = slam.correction().apply(time_ns, T_odo_body)
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
@@ -34,6 +35,7 @@ Pair = tuple[int, int]
 """Numbers of two local maps, (query, place), the later one first."""
 
 _FAR, _SEVERAL = 3.0, 2  # limits of the innovation beyond which a loop is false rather than the odometry, loops for a doubt
+_FIRST = 256  # local maps that there is room for in the beginning
 _KEPT_SURFACES = 12  # trees over local maps are built again where they are older
 
 
@@ -49,7 +51,7 @@ class Slam:
 
     Attributes:
         loops: every loop that was looked at, the latest state of each.
-        T_map: (7,) of each local map, as estimated now.
+        T_map: (n, 7) of the local maps, as estimated now.
 
     Raises:
         InputError: a pair that is forbidden and forced, or not of an earlier map; OpenCV, the extra `vision`, is not installed.
@@ -78,7 +80,7 @@ class Slam:
         self._closed = 0  # maps that the last closing saw
         self._scale = 1.0  # of the odometry's covariances, see `_drift_scale`
         self.loops: list[Loop] = []
-        self.T_map: list[Floats] = []
+        self._placed = np.zeros((_FIRST, 7))  # T_map, and room for more
 
     def add(self, local_map: LocalMap) -> list[Loop]:
         """Take the next local map; returns the loops that were looked at for it, most of them refused.
@@ -92,7 +94,9 @@ class Slam:
         self._maps.append(local_map if self._stored is None else replace(local_map, points=local_map.points[:0]))
         self._newest = local_map
         self._odometry.add(local_map)
-        self.T_map.append(self._predicted(query))
+        if query == len(self._placed):
+            self._placed = np.concatenate([self._placed, np.zeros_like(self._placed)])
+        self._placed[query] = self._predicted(query)
         self._rms.append(self._rms_of_odometry(query))
         verified = [self._verified(query, proposal) for proposal in self._proposals(query)]
         looked_at = _without_contradictions(verified, self._odometry, self.config)
@@ -101,6 +105,11 @@ class Slam:
         if any(loop.refusal is None for loop in self.loops[first:]):
             self._close()
         return self.loops[first:]
+
+    @property
+    def T_map(self) -> Floats:
+        """See the class."""
+        return self._placed[: len(self._maps)]
 
     @property
     def doubt(self) -> str | None:
@@ -134,7 +143,7 @@ class Slam:
         return Correction(
             np.array([m.time_ns for m in self._maps], dtype=np.int64),
             np.stack(self._odometry.poses),
-            np.stack(self.T_map),
+            self.T_map.copy(),
             *self._covariances(steps),
             steps,
         )
@@ -181,7 +190,8 @@ class Slam:
             self.config.gravity_sigma,
             [k in forced for k in chosen],
         )
-        self._closed, self.T_map = len(graph.T_map), list(graph.T_map)
+        self._closed = len(graph.T_map)
+        self._placed[: self._closed] = graph.T_map
         kept = {k for k, is_kept in zip(chosen, graph.is_kept, strict=True) if is_kept}
         for k in standing:
             self.loops[k] = replace(self.loops[k], weight=float(k in kept))
@@ -208,11 +218,12 @@ class Slam:
     def _predicted(self, query: int) -> Floats:
         """Where a new local map is, from the corrected pose of the one before."""
         poses = self._odometry.poses
-        return poses[0] if query == 0 else se3.compose(self.T_map[-1], se3.compose(se3.inverse(poses[-2]), poses[-1]))
+        if query == 0:
+            return poses[0]
+        return se3.compose(self._placed[query - 1], se3.compose(se3.inverse(poses[-2]), poses[-1]))
 
     def _proposals(self, query: int) -> list[Proposal]:
-        way = self._maps[query].path_m - np.array([m.path_m for m in self._maps])
-        before = int(np.count_nonzero(way >= self.config.least_way))
+        before = bisect_right(self._maps, self._maps[query].path_m - self.config.least_way, key=lambda m: m.path_m)
         found = self._proposer.propose(query, self._map, before, self._odometry, self.T_map)
         free = [p for p in found if (query, p.place) not in self._forbidden and (query, p.place) not in self._forced]
         wanted = sorted(place for q, place in self._forced if q == query)
