@@ -32,7 +32,7 @@ from boxplus.optimization.terms.variables import VariableRows, Variables
 from boxplus.optimization.terms.weighting import checked_weights
 from boxplus.residuals.marginal_prior import MarginalPrior
 from boxplus.residuals.residual import Residual
-from boxplus.sparse.cholesky import Analyses, NotPositiveDefinite
+from boxplus.sparse.cholesky import Analyses, Analysis, NotPositiveDefinite
 
 # Share of a group that may have lost its weight before the problem is analysed anew without it.
 _STALE = 0.05

@@ -12,7 +12,7 @@ from boxplus.optimization.linear_systems.dense_kernels import factorize_dense, s
 from boxplus.optimization.linear_systems.normal_equations import NormalEquations
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.layout import Layout
-from boxplus.sparse.cholesky import Analyses, NotPositiveDefinite, SparseCholesky
+from boxplus.sparse.cholesky import Analyses, Analysis, NotPositiveDefinite, SparseCholesky
 from boxplus.sparse.multifrontal import SINGULAR
 
 
@@ -24,9 +24,11 @@ class LinearSystem(ABC):
         gradient: g = Jᵀr (dof,).
         diagonal: of H (dof,).
         reads_jacobians: `factorize` reads the Jacobians of the groups, which must be those that were assembled.
+        analysis: of the sparse matrix that is factorised; None where there is none.
     """
 
     reads_jacobians = False
+    analysis: Analysis | None = None
     description: str
     gradient: NDArray[np.float64]
     diagonal: NDArray[np.float64]
@@ -109,6 +111,7 @@ class SparseSystem(LinearSystem):
         self._equations = NormalEquations(layout, groups)
         self._threads = threads
         self._cholesky = SparseCholesky(self._equations.pattern, threads=threads, known=known)
+        self.analysis = self._cholesky.analysis
         self.description = (
             f"sparse Cholesky of {layout.dof} degrees of freedom, {self._cholesky.nnz_factor:,} non-zeros in the factor"
         )

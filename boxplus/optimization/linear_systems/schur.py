@@ -64,6 +64,7 @@ class SchurSystem(LinearSystem):
         self._pattern, self._places, self._products = build_products(self._rest, self._equations.pattern, self._entries, count)
         self._values = np.zeros(int(self._pattern.value_start[-1]))
         self._cholesky = SparseCholesky(self._pattern, threads=threads, known=known)
+        self.analysis = self._cholesky.analysis
         self.gradient, self.diagonal = np.zeros(layout.dof), np.zeros(layout.dof)
         self.description = (
             f"Schur elimination of {count} {eliminated.name!r} ({e} degrees of freedom each, no residual connects two of them), "
