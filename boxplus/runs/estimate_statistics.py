@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.runs.run_facts import Distribution, Gap, WarningFacts, WeakInterval
-from boxplus.sensors.sequencer import BEYOND, EMPTY, GLITCH, NOT_FINITE
+from boxplus.sensors.imu_values import BEYOND, EMPTY, GLITCH, NOT_FINITE
 
 _MOST_ENTRIES = 1000
 _GAP_FACTOR = 3.0

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.sensors.imu import ImuSamples
 
+NOT_FINITE, BEYOND = "IMU sample not finite", "IMU sample beyond any sensor"
+EMPTY, GLITCH = "IMU sample of zeros", "IMU sample unlike both of its neighbours"
+"""Why a sample is left out that a sensor in order, and its driver, never deliver."""
 GYRO_LIMIT, ACCEL_LIMIT = 100.0, 400.0  # rad/s, m/s²: more than any IMU on a robot measures
 _GLITCH_GYRO, _GLITCH_ACCEL = 3.0, 100.0  # rad/s, m/s²: no platform turns or is pushed so much within two samples, and back
 _USUAL = 10.0  # times what samples usually differ by: a shaken IMU differs from sample to sample
@@ -27,6 +32,24 @@ def beyond(imu: ImuSamples) -> NDArray[np.bool_]:
 def empty(imu: ImuSamples) -> NDArray[np.bool_]:
     """(N,) which samples are zero throughout: messages that nobody filled, as nothing measures exactly that."""
     return np.asarray(~(imu.gyro.any(axis=1) | imu.accel.any(axis=1)))
+
+
+def measurements(imu: ImuSamples, rejected: Counter[str]) -> ImuSamples:
+    """Samples that can be measurements; the others are counted by reason."""
+    numbers, too_large, zero = finite(imu), beyond(imu), empty(imu)
+    for reason, mask in ((NOT_FINITE, ~numbers), (BEYOND, too_large & numbers), (EMPTY, zero)):
+        if mask.any():
+            rejected[reason] += int(mask.sum())
+    return imu.where(numbers & ~too_large & ~zero)
+
+
+def calm(imu: ImuSamples) -> bool:
+    """Whether no sample is so far from the one before that it could be a glitch."""
+    steps = (np.diff(values, axis=0) for values in (imu.gyro, imu.accel))
+    return all(
+        not len(step) or float(np.linalg.norm(step, axis=1).max()) <= least
+        for step, least in zip(steps, (_GLITCH_GYRO, _GLITCH_ACCEL), strict=True)
+    )
 
 
 def glitches(imu: ImuSamples) -> NDArray[np.bool_]:

@@ -14,14 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.sensors.checked import checked_imu, checked_scan
+from boxplus.sensors.glitch_filter import GlitchFilter
 from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import ACCEL_LIMIT, GYRO_LIMIT, beyond, empty, finite, glitches
+from boxplus.sensors.imu_values import ACCEL_LIMIT, GLITCH, GYRO_LIMIT, empty, measurements
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.time_steps import TimeSteps
 
-NOT_FINITE, BEYOND = "IMU sample not finite", "IMU sample beyond any sensor"
-EMPTY, GLITCH = "IMU sample of zeros", "IMU sample unlike both of its neighbours"
-"""Of samples that a sensor in order, and its driver, never deliver."""
 _COMPARED = 500  # points, of scans that have as many
 _EARLIER = 1.5  # intervals between samples: as long before the first one its values are held
 
@@ -74,7 +72,9 @@ class Sequencer:
         self._max_wait_ns = int(max_wait_s * 1e9)
         self._max_jump_ns = int(max_jump_s * 1e9)
         self._imu: deque[ImuSamples] = deque()
+        self._glitches = GlitchFilter()
         self._last_imu_ns: int | None = None
+        self._known_until_ns: int | None = None  # by samples that are no glitches
         self._scans: deque[Scan] = deque()
         self._last_end_ns: int | None = None
         self._newest_scan_end_ns: int | None = None
@@ -103,7 +103,7 @@ class Sequencer:
             self._imu_jumps = 0
             self._imu_steps.went_on()
             self._last_imu_ns = int(samples.time_ns[-1])
-            self._imu.append(samples)
+            self._keep(self._glitches.take(samples))
             self._imu_taken += len(samples)
         else:
             self._add_one_by_one(samples)
@@ -119,15 +119,10 @@ class Sequencer:
         return not len(steps) or bool(steps.min() > 0 and steps.max() <= self._max_jump_ns)
 
     def _add_one_by_one(self, samples: ImuSamples) -> None:
-        numbers, too_large, zero = finite(samples), beyond(samples), empty(samples)
-        self.rejected[NOT_FINITE] += int((~numbers).sum())
-        if (too_large & numbers).any():  # what is not finite is not counted twice
-            self.rejected[BEYOND] += int((too_large & numbers).sum())
-        if zero.any():
-            self.rejected[EMPTY] += int(zero.sum())
+        samples = measurements(samples, self.rejected)
         time = samples.time_ns
         keep = np.zeros(len(samples), dtype=bool)
-        for i in np.flatnonzero(numbers & ~too_large & ~zero):
+        for i in range(len(samples)):
             now, last = int(time[i]), self._last_imu_ns
             if last is not None and now == last:
                 self.rejected["IMU sample with a repeated time"] += 1
@@ -136,6 +131,7 @@ class Sequencer:
                 # The first sample of all was the one that is wrong: nothing else is near it.
                 self.rejected["IMU sample far ahead of all that follow"] += 1
                 self._imu.clear()
+                self._glitches = GlitchFilter()
                 keep[:] = False
                 self._imu_taken, last = 0, None
             if last is not None and now < last:
@@ -151,8 +147,14 @@ class Sequencer:
             self._last_imu_ns = now
             keep[i] = True
         self._imu_taken += int(keep.sum())
-        if keep.any():
-            self._imu.append(samples.where(keep))
+        self._keep(self._glitches.take(samples.where(keep)))
+
+    def _keep(self, samples: ImuSamples) -> None:
+        if self._glitches.found:
+            self.rejected[GLITCH] = self._glitches.found
+        if len(samples):
+            self._imu.append(samples)
+            self._known_until_ns = int(samples.time_ns[-1])
 
     def add_scan(self, scan: Scan) -> None:
         """Take a scan in; one that is empty, or does not end after the one before, is counted and left out.
@@ -211,10 +213,12 @@ class Sequencer:
 
     def frames(self, *, flush: bool = False) -> list[Frame]:
         """The frames that are complete by now; with `flush`, also those that never will be."""
+        if flush:
+            self._keep(self._glitches.rest())
         ready = []
         while self._scans:
             scan = self._scans[0]
-            covered = self._last_imu_ns is not None and self._last_imu_ns >= scan.end_ns
+            covered = self._known_until_ns is not None and self._known_until_ns >= scan.end_ns
             waited = (self._newest_scan_end_ns or 0) - scan.end_ns >= self._max_wait_ns
             if not (covered or waited or flush):
                 break
@@ -263,17 +267,10 @@ class Sequencer:
         """Samples from the last at or before `begin_ns` to the first at or after `end_ns`; older ones are forgotten."""
         block = self._joined()
         stop = min(int(np.searchsorted(block.time_ns, end_ns, side="left")) + 1, len(block))
-        odd = glitches(block.where(slice(stop)))
-        unsure = bool(stop) and bool(odd[-1])  # of the last sample the next one will tell
-        odd[-1:] = False
-        if odd.any():
-            self.rejected[GLITCH] += int(odd.sum())
-            block = block.where(np.concatenate([~odd, np.ones(len(block) - stop, dtype=bool)]))
-            stop -= int(odd.sum())
         first = max(int(np.searchsorted(block.time_ns, begin_ns, side="right")) - 1, 0)
         # Two samples at or before the end stay: the next frame needs the last one before its begin.
         self._imu = deque([block.where(slice(max(stop - 2, 0), None))])
-        return block.where(slice(first, stop - 1 if unsure and stop - 1 > first else stop))
+        return block.where(slice(first, stop))
 
     def _joined(self) -> ImuSamples:
         """All samples kept, as one block."""

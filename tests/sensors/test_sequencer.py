@@ -197,7 +197,7 @@ def test_a_jump_that_lasts_is_the_new_time() -> None:
     sequencer.add_imu(_imu(0, 5, 10))
     later = 60_000.0 + 5.0 * np.arange(30)
     sequencer.add_imu(_imu(*later))
-    assert sequencer.rejected == {"IMU sample not finite": 0, "IMU sample jumping ahead in time": 10}
+    assert sequencer.rejected == {"IMU sample jumping ahead in time": 10}
     sequencer.add_scan(_scan(60_060, 60_100))
     (frame,) = sequencer.frames()
     assert frame.covered

@@ -24,8 +24,10 @@ from boxplus.manifolds import quaternion, so3
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.sensors.checked import checked_imu
 from boxplus.sensors.eight_bits import EightBits
+from boxplus.sensors.glitch_filter import GlitchFilter
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.imu_values import GLITCH, measurements
 from boxplus.sensors.repeated_images import RepeatedImages
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.focal_watch import FocalWatch
@@ -94,7 +96,8 @@ class VisualInertialOdometry:
         self._line_tracker = line_tracker
         if self.config.lines and line_tracker is None:
             self._line_tracker = LineTracker(require("cv2", "which finds lines"), self.rig, self.config.max_lines)
-        self._imu = ImuSamples.joined([])
+        self._imu, self._glitches = ImuSamples.joined([]), GlitchFilter()
+        self._newest_imu_ns = -(2**62)
         self._images: dict[int, dict[int, NDArray[Any]]] = {}
         self._search = StartSearch()
         self._repeated = RepeatedImages()
@@ -116,13 +119,13 @@ class VisualInertialOdometry:
             if gyro is None or accel is None:
                 raise InputError("times, gyro and accel", "times alone", "give all three, or ImuSamples")
             samples = ImuSamples.from_arrays(samples, gyro, accel)
-        samples = checked_imu(samples)
-        last = self._imu.time_ns[-1] if len(self._imu) else -(2**62)
-        ahead = samples.time_ns > np.maximum.accumulate(np.concatenate([[last], samples.time_ns[:-1]]))
-        usable = ahead & np.isfinite(samples.gyro).all(axis=1) & np.isfinite(samples.accel).all(axis=1)
-        self._counters["IMU samples not finite or out of order"] += int((~usable).sum())
-        chosen = ImuSamples(samples.time_ns[usable], samples.gyro[usable], samples.accel[usable])
-        self._imu = ImuSamples.joined([self._imu, chosen])
+        samples = measurements(checked_imu(samples), self._counters)
+        last = np.concatenate([[self._newest_imu_ns], samples.time_ns[:-1]])
+        ahead = samples.time_ns > np.maximum.accumulate(last)
+        self._counters["IMU sample out of order"] += int((~ahead).sum())
+        samples = samples.where(ahead)
+        self._newest_imu_ns = int(samples.time_ns[-1]) if len(samples) else self._newest_imu_ns
+        self._imu = ImuSamples.joined([self._imu, self._glitches.take(samples)])
         return self._advance(final=False)
 
     def push_image(self, image: CameraImage) -> list[VioEstimate]:
@@ -147,6 +150,7 @@ class VisualInertialOdometry:
 
     def flush(self) -> list[VioEstimate]:
         """No more data will come: process what still waits."""
+        self._imu = ImuSamples.joined([self._imu, self._glitches.rest()])
         return self._advance(final=True)
 
     def snapshot(self) -> dict[str, object]:
@@ -166,7 +170,8 @@ class VisualInertialOdometry:
     @property
     def counters(self) -> Mapping[str, int]:
         """What could not be used before it reached the window, by reason."""
-        return Counter({reason: count for reason, count in self._counters.items() if count})
+        counts = self._counters + Counter({GLITCH: self._glitches.found})
+        return Counter({reason: count for reason, count in counts.items() if count})
 
     @property
     def start_problem(self) -> str | None:
