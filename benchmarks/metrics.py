@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 Direction = Literal["lower", "higher"]
+_TIMES = ("ns", "us", "ms", "s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +169,13 @@ def regressions(baseline: dict[str, Expected], metrics: Iterable[Metric], benchm
                 f"{'most' if expected.direction == 'lower' else 'least'} {limit:.4g} allowed"
             )
     return found
+
+
+def untimed(baseline: dict[str, Expected], metrics: Sequence[Metric]) -> tuple[dict[str, Expected], list[Metric]]:
+    """Of a baseline and of a run the figures that no load changes: those that are not times, nor ratios of times."""
+    kept = [metric for metric in metrics if metric.unit not in _TIMES]
+    timed = {metric.name for metric in metrics} - {metric.name for metric in kept}
+    return {name: expected for name, expected in baseline.items() if name not in timed}, kept
 
 
 def run_as_script(

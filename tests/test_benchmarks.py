@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -119,6 +120,22 @@ def test_gate_and_update_of_the_runner(modules, monkeypatch, tmp_path, capsys):
     assert run.main([*paths, "--gate"]) == 1
     assert "REGRESSION  scan/total: 1 ratio, baseline 0.75 and at most 0.825 allowed" in capsys.readouterr().out
     assert run.main(paths) == 0, "without --gate nothing is compared"
+
+
+def test_an_untimed_gate_judges_what_no_load_changes(modules, monkeypatch, tmp_path, capsys):
+    run, Metric = modules[1], modules[0].Metric
+    baseline = tmp_path / "baseline.json"
+    slow = Metric("scan/total", 9.0, "ms", opponent="cKDTree", opponent_value=4.0)
+    fake(modules, monkeypatch, replace(slow, value=4.0), Metric("scan/memory", 30.0, "bytes", tolerance=0.1))
+    assert run.main(["scan", "--baseline", str(baseline), "--update-baseline"]) == 0
+    for memory, code in ((32.0, 0), (34.0, 1)):
+        fake(modules, monkeypatch, slow, Metric("scan/memory", memory, "bytes"))
+        assert run.main(["scan", "--baseline", str(baseline), "--gate", "--untimed"]) == code
+        assert run.main(["scan", "--baseline", str(baseline), "--gate"]) == 1
+    fake(modules, monkeypatch, slow)
+    capsys.readouterr()
+    assert run.main(["scan", "--baseline", str(baseline), "--gate", "--untimed"]) == 1
+    assert "REGRESSION  scan/memory: in the baseline, but not measured" in capsys.readouterr().out
 
 
 def test_an_update_keeps_other_benchmarks_and_drops_figures_that_are_gone(modules):
