@@ -2,10 +2,10 @@
 
     python benchmarks/run.py [NAME ...] [--json FILE] [--gate [--untimed] | --update-baseline] [--quick]
 
-Names: knn_static map_dynamic scan recordings memory map_growth cholesky ordering …; all of them when none is given. Each is
-a process of its own. `--gate` exits with 1 when a figure is worse than in the baseline by more than its tolerance, with `--untimed`
-only when it is one that no load changes. `--update-baseline` takes the figures of this run for those to come, deliberately.
-`--quick` is a smoke run: its figures mean nothing.
+Names: knn_static map_dynamic scan recordings memory map_growth cholesky ordering …; all of them when none is given. Each is a
+process of its own. `--gate` exits with 1 when a figure is worse than in the baseline by more than its tolerance, with
+`--untimed` only when it is one that no load changes. `--update-baseline` takes the figures of this run for those to come,
+deliberately. `--quick` is a smoke run: its figures mean nothing.
 """
 
 from __future__ import annotations
