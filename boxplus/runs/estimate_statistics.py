@@ -170,7 +170,7 @@ class EstimateStatistics:
             WarningFacts(
                 text=f"{counters[reason]} of {self.imu_samples_read} IMU samples {what} and were left out: a sensor in order "
                 "and its driver deliver none such",
-                count=1,
+                count=counters[reason],
             )
             for reason, what in _NO_MEASUREMENTS.items()
             if counters.get(reason)

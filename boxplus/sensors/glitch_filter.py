@@ -2,50 +2,59 @@
 
 from __future__ import annotations
 
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import calm, glitches
+from collections import Counter
 
-_CONTEXT = 20  # samples before one tell what they usually differ by
+import numpy as np
+
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.imu_values import EMPTY, GLITCH, empty, glitches
+
+_CONTEXT = 22  # samples before one that tell what is usual
 
 
 class GlitchFilter:
-    """Takes samples in order of time, hands on all but glitches (`imu_values.glitches`).
+    """Takes samples in order of time, hands on all but glitches (`imu_values.glitches`) and messages that nobody filled.
 
     A sample that is far from the one before waits for the next one, which tells. What is handed on does not depend on how the
-    samples are cut into blocks.
+    samples are cut into blocks. An IMU that has only ever delivered zeros is handed on: what looks for gravity says so.
 
     Attributes:
-        found: how many were left out.
+        rejected: reason → samples.
     """
 
     def __init__(self) -> None:
-        self.found = 0
-        self._before = ImuSamples.joined([])
-        self._doubted = ImuSamples.joined([])
+        self.rejected: Counter[str] = Counter()
+        self._is_alive = False
+        self._before = ImuSamples.joined([])  # as they came, the newest last
+        self._waits = False  # the newest one
 
     def take(self, samples: ImuSamples) -> ImuSamples:
         """What is known by now to be none."""
-        if not len(self._doubted) and calm(ImuSamples.joined([self._before.where(slice(-1, None)), samples])):
-            return self._known(samples)
-        return ImuSamples.joined([self._one(samples.where(slice(k, k + 1))) for k in range(len(samples))])
+        zero = empty(samples)
+        if zero.any():
+            dropped = zero & (self._is_alive | np.logical_or.accumulate(~zero))
+            self._reject(EMPTY, int(dropped.sum()))
+            samples = samples.where(~dropped)
+        if not len(samples):
+            return samples
+        self._is_alive = self._is_alive or not bool(zero.all())
+        known = len(self._before) - int(self._waits)  # of them, what has been judged
+        seen = ImuSamples.joined([self._before, samples])
+        odd = glitches(seen)
+        self._waits = bool(odd[-1])
+        odd[-1] = False
+        self._before = seen.where(slice(-_CONTEXT, None))
+        keep = ~odd
+        keep[:known] = False
+        keep[len(seen) - int(self._waits) :] = False
+        self._reject(GLITCH, int(odd[known:].sum()))
+        return seen.where(keep)
 
     def rest(self) -> ImuSamples:
         """The sample that still waits, of which no other will tell."""
-        doubted, self._doubted = self._doubted, ImuSamples.joined([])
-        return self._known(doubted)
+        waits, self._waits = self._waits, False
+        return self._before.where(slice(len(self._before) - int(waits), None))
 
-    def _one(self, sample: ImuSamples) -> ImuSamples:
-        taken = ImuSamples.joined([])
-        if len(self._doubted):
-            if glitches(ImuSamples.joined([self._before, self._doubted, sample]))[-2]:
-                self.found += 1
-                self._doubted = taken
-            taken = self.rest()
-        if glitches(ImuSamples.joined([self._before, sample]))[-1]:
-            self._doubted = sample
-            return taken
-        return ImuSamples.joined([taken, self._known(sample)])
-
-    def _known(self, samples: ImuSamples) -> ImuSamples:
-        self._before = ImuSamples.joined([self._before, samples]).where(slice(-_CONTEXT, None))
-        return samples
+    def _reject(self, reason: str, count: int) -> None:
+        if count:
+            self.rejected[reason] += count

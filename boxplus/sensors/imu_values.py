@@ -11,12 +11,11 @@ from boxplus.sensors.imu import ImuSamples
 
 NOT_FINITE, BEYOND = "IMU sample not finite", "IMU sample beyond any sensor"
 EMPTY, GLITCH = "IMU sample of zeros", "IMU sample unlike both of its neighbours"
-"""Why a sample is left out that a sensor in order, and its driver, never deliver."""
 GYRO_LIMIT, ACCEL_LIMIT = 100.0, 400.0  # rad/s, m/s²: more than any IMU on a robot measures
-_GLITCH_GYRO, _GLITCH_ACCEL = 3.0, 100.0  # rad/s, m/s²: no platform turns or is pushed so much within two samples, and back
-_USUAL = 10.0  # times what samples usually differ by: a shaken IMU differs from sample to sample
-_NEAR_NS = 20_000_000  # farther apart, samples may differ by any motion
-_FEWEST = 4
+# Per second, and at least: no platform turns or is pushed so much from one sample to the next, and back to the one after.
+_GLITCH_GYRO, _GLITCH_ACCEL = (1000.0, 3.0), (20_000.0, 100.0)  # rad/s² and rad/s, m/s³ and m/s²
+_USUAL = 10.0  # times what the samples before differ by: a shaken IMU differs from sample to sample
+_BEFORE, _FEWEST = 20, 8  # steps before a sample that tell what is usual
 
 
 def finite(imu: ImuSamples) -> NDArray[np.bool_]:
@@ -35,40 +34,36 @@ def empty(imu: ImuSamples) -> NDArray[np.bool_]:
 
 
 def measurements(imu: ImuSamples, rejected: Counter[str]) -> ImuSamples:
-    """Samples that can be measurements; the others are counted by reason."""
-    numbers, too_large, zero = finite(imu), beyond(imu), empty(imu)
-    for reason, mask in ((NOT_FINITE, ~numbers), (BEYOND, too_large & numbers), (EMPTY, zero)):
+    """Samples that are numbers within what sensors measure; the others are counted by reason."""
+    numbers, too_large = finite(imu), beyond(imu)
+    for reason, mask in ((NOT_FINITE, ~numbers), (BEYOND, too_large & numbers)):
         if mask.any():
             rejected[reason] += int(mask.sum())
-    return imu.where(numbers & ~too_large & ~zero)
-
-
-def calm(imu: ImuSamples) -> bool:
-    """Whether no sample is so far from the one before that it could be a glitch."""
-    steps = (np.diff(values, axis=0) for values in (imu.gyro, imu.accel))
-    return all(
-        not len(step) or float(np.linalg.norm(step, axis=1).max()) <= least
-        for step, least in zip(steps, (_GLITCH_GYRO, _GLITCH_ACCEL), strict=True)
-    )
+    return imu.where(numbers & ~too_large)
 
 
 def glitches(imu: ImuSamples) -> NDArray[np.bool_]:
-    """(N,) which samples of some in order of time stand out from both of their neighbours, to which they are alike.
+    """(N,) which samples of some in order of time stand out from both of their neighbours, which are alike: no motion does that.
 
-    A bit that flips on the way, not a motion. Of the last one only the sample before is known.
+    Far from a neighbour is what no platform could turn or be pushed by in between, and ten times as far as the samples
+    before are from one another; the first nine are not judged. Of the last one only the sample before is known.
     """
     mask = np.zeros(len(imu), dtype=bool)
-    if len(imu) < _FEWEST:
+    if len(imu) < 2:
         return mask
-    near, last_is_far = np.diff(imu.time_ns) <= _NEAR_NS, False
-    for values, least in ((imu.gyro, _GLITCH_GYRO), (imu.accel, _GLITCH_ACCEL)):
+    last_is_far = False
+    seconds = 1e-9 * np.diff(imu.time_ns)
+    for values, (rate, least) in ((imu.gyro, _GLITCH_GYRO), (imu.accel, _GLITCH_ACCEL)):
         steps = np.linalg.norm(np.diff(values, axis=0), axis=1)
-        largest = steps.max()
-        if not largest > least:  # nearly always
-            continue
-        far = near & (steps > max(least, _USUAL * float(np.median(steps))))
-        across = np.linalg.norm(values[2:] - values[:-2], axis=1)
-        mask[1:-1] |= far[1:] & far[:-1] & (across < 0.5 * np.minimum(steps[1:], steps[:-1]))
-        last_is_far |= bool(far[-1])
+        far = steps > np.maximum(least, rate * seconds)
+        for k in np.flatnonzero(far):  # the step into sample k + 1; nearly always there is none
+            before = steps[max(k - _BEFORE, 0) : k]
+            if mask[k] or len(before) < _FEWEST or not steps[k] > _USUAL * float(np.median(before)):
+                continue
+            if k + 2 == len(imu):
+                last_is_far = True
+            elif far[k + 1]:
+                across = float(np.linalg.norm(values[k + 2] - values[k]))
+                mask[k + 1] |= across < 0.5 * min(steps[k], steps[k + 1])
     mask[-1] = last_is_far and not mask[-2]
     return mask

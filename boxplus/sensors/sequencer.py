@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from boxplus.sensors.checked import checked_imu, checked_scan
 from boxplus.sensors.glitch_filter import GlitchFilter
 from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import ACCEL_LIMIT, GLITCH, GYRO_LIMIT, empty, measurements
+from boxplus.sensors.imu_values import ACCEL_LIMIT, GYRO_LIMIT, measurements
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.time_steps import TimeSteps
 
 _COMPARED = 500  # points, of scans that have as many
+_TURNS, _PUSHED = 0.05, 0.3  # rad/s, m/s²: largest rate and standard deviation of an IMU that may rest
 _EARLIER = 1.5  # intervals between samples: as long before the first one its values are held
 
 
@@ -82,7 +83,7 @@ class Sequencer:
         self._scan_jumps = 0
         self._imu_taken = 0
         self._scans_taken = 0
-        self._newest_points = ""  # digest of some of the scan before, where it was no repetition itself
+        self._newest_points = ""  # digest of some of the scan before
         self._imu_steps, self._scan_steps = TimeSteps("IMU"), TimeSteps("LiDAR")
 
     @property
@@ -112,8 +113,6 @@ class Sequencer:
         """Whether nothing is wrong with any sample: the usual case, which costs no loop. NaN compares false."""
         last, time = self._last_imu_ns, samples.time_ns
         if not (np.abs(samples.gyro).max() <= GYRO_LIMIT and np.abs(samples.accel).max() <= ACCEL_LIMIT):
-            return False
-        if empty(samples).any():
             return False
         steps = np.diff(time if last is None else np.concatenate([[last], time]))
         return not len(steps) or bool(steps.min() > 0 and steps.max() <= self._max_jump_ns)
@@ -150,8 +149,8 @@ class Sequencer:
         self._keep(self._glitches.take(samples.where(keep)))
 
     def _keep(self, samples: ImuSamples) -> None:
-        if self._glitches.found:
-            self.rejected[GLITCH] = self._glitches.found
+        for reason, count in self._glitches.rejected.items():
+            self.rejected[reason] = count
         if len(samples):
             self._imu.append(samples)
             self._known_until_ns = int(samples.time_ns[-1])
@@ -190,26 +189,11 @@ class Sequencer:
                 self._scan_jumps += 1
                 self.rejected["scan jumping ahead in time"] += 1
                 return
-        if self._repeats(scan.p_lidar):
-            self.rejected[REPEATED] += 1
-            return
         self._scan_jumps = 0
         self._scans_taken += 1
         self._scan_steps.went_on()
         self._newest_scan_end_ns = scan.end_ns
         self._scans.append(scan)
-
-    def _repeats(self, p_lidar: NDArray[np.float32]) -> bool:
-        """Whether these are the points of the scan before, to the bit.
-
-        Never of two scans in a row: a simulated LiDAR without noise gives the same points as long as it rests.
-        """
-        some = ""
-        if len(p_lidar) >= _COMPARED:
-            some = hashlib.blake2b(p_lidar[:: len(p_lidar) // _COMPARED].tobytes(), digest_size=16).hexdigest()
-        repeats = bool(some) and some == self._newest_points
-        self._newest_points = "" if repeats else some
-        return repeats
 
     def frames(self, *, flush: bool = False) -> list[Frame]:
         """The frames that are complete by now; with `flush`, also those that never will be."""
@@ -240,8 +224,24 @@ class Sequencer:
         first = max(int(np.searchsorted(block.time_ns, time_ns, side="right")) - 1, 0)
         return block.where(slice(first, None))
 
+    def _repeats(self, scan: Scan, begin_ns: int) -> bool:
+        """Whether a scan has the points of the one before, to the bit, while the IMU moved.
+
+        A simulated LiDAR without noise gives the same points as long as it rests.
+        """
+        before, self._newest_points = self._newest_points, _digest(scan.p_lidar)
+        if not before or before != self._newest_points:
+            return False
+        imu = self._joined()
+        first, stop = np.searchsorted(imu.time_ns, [begin_ns, scan.end_ns], side="right")
+        gyro, accel = imu.gyro[first:stop], imu.accel[first:stop]
+        return bool(np.abs(gyro).max(initial=0.0) > _TURNS or (len(accel) and accel.std(axis=0).max() > _PUSHED))
+
     def _frame(self, scan: Scan, covered: bool) -> Frame | None:
         begin = scan.start_ns if self._last_end_ns is None else self._last_end_ns
+        if self._repeats(scan, begin):
+            self.rejected[REPEATED] += 1
+            return None
         imu = self._take_until(begin, scan.end_ns)
         if not len(imu):
             self.rejected["scan without any IMU sample"] += 1
@@ -277,6 +277,13 @@ class Sequencer:
         if len(self._imu) != 1:
             self._imu = deque([ImuSamples.joined(self._imu)])
         return self._imu[0]
+
+
+def _digest(p_lidar: NDArray[np.float32]) -> str:
+    """Of some points; empty where there are few, which may be the same by chance."""
+    if len(p_lidar) < _COMPARED:
+        return ""
+    return hashlib.blake2b(p_lidar[:: len(p_lidar) // _COMPARED].tobytes(), digest_size=16).hexdigest()
 
 
 def joined_imu(frames: Sequence[Frame]) -> ImuSamples:

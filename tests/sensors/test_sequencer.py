@@ -320,13 +320,17 @@ def test_a_first_scan_far_ahead_does_not_shut_out_all_that_follow() -> None:
     assert sequencer.rejected == {"scan far ahead of all that follow": 1}
 
 
-def test_a_scan_that_comes_again_with_new_stamps_is_left_out_but_never_two_in_a_row() -> None:
+@pytest.mark.parametrize("turning", [True, False])
+def test_scans_that_come_again_with_new_stamps_are_left_out_while_the_imu_moves(turning: bool) -> None:
     random = np.random.default_rng(3)
     first, second = random.normal(size=(2, 3000, 3))
     sequencer = Sequencer()
+    time_ns = 5_000_000 * np.arange(170)
+    gyro = np.full((170, 3), 0.2 if turning else 0.01)
+    sequencer.add_imu(ImuSamples(time_ns, gyro, np.full((170, 3), 5.0)))
     for index, points in enumerate((first, first, second, second, second, first, first[:2900], first)):
         begin_ns = 100_000_000 * index
         sequencer.add_scan(Scan.from_arrays(points, begin_ns + np.arange(len(points))))
-    taken = [scan.start_ns // 100_000_000 for scan in sequencer.take_scans()]
-    assert taken == [0, 2, 4, 5, 6, 7]
-    assert sequencer.rejected == {REPEATED: 2}
+    taken = [frame.scan.start_ns // 100_000_000 for frame in sequencer.frames(flush=True)]
+    assert taken == ([0, 2, 5, 6, 7] if turning else list(range(8)))
+    assert sequencer.rejected == ({REPEATED: 3} if turning else {})

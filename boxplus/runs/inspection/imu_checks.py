@@ -139,11 +139,13 @@ def check_saturation(imu: ImuSamples) -> Evidence:
 
 def check_finite(imu: ImuSamples) -> list[Evidence]:
     """IMU samples that no sensor in order delivers."""
+    numbers, too_large, zero = finite(imu), beyond(imu), empty(imu)
+    rest = imu.where(numbers & ~too_large & ~zero)
     kinds = (
-        (~finite(imu), "not finite"),
-        (beyond(imu), "beyond any sensor"),
-        (empty(imu), "zero throughout"),
-        (glitches(imu), "unlike both of their neighbours"),
+        (~numbers, "not finite"),
+        (too_large & numbers, "beyond any sensor"),
+        (zero, "zero throughout"),
+        (glitches(rest), "unlike both of their neighbours"),
     )
     bad = [f"{np.count_nonzero(mask)} {kind}" for mask, kind in kinds if mask.any()]
     if not bad:

@@ -265,7 +265,9 @@ def usable(imu: ImuSamples) -> ImuSamples:
     Few that are larger than any sensor measures are none; where they are many, the unit is in question, and they stay. One that
     stands out from both of its neighbours is none either.
     """
-    keep, too_large = finite(imu) & ~empty(imu), beyond(imu)
+    keep, too_large, zero = finite(imu), beyond(imu), empty(imu)
+    if not zero.all():
+        keep &= ~zero
     if np.count_nonzero(too_large) < _GLITCHES * len(imu):
         keep &= ~too_large
     imu = imu.where(keep)

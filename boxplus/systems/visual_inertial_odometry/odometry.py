@@ -27,7 +27,7 @@ from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.glitch_filter import GlitchFilter
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import GLITCH, measurements
+from boxplus.sensors.imu_values import measurements
 from boxplus.sensors.repeated_images import RepeatedImages
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.focal_watch import FocalWatch
@@ -170,7 +170,7 @@ class VisualInertialOdometry:
     @property
     def counters(self) -> Mapping[str, int]:
         """What could not be used before it reached the window, by reason."""
-        counts = self._counters + Counter({GLITCH: self._glitches.found})
+        counts = self._counters + self._glitches.rejected
         return Counter({reason: count for reason, count in counts.items() if count})
 
     @property

@@ -300,7 +300,8 @@ def _checked_fit(seen: Beginning, path: LidarPath) -> TranslationFit:
     fit = moving_fit(seen.frames, path, seen.imu, seen.extrinsic, seen.config)
     if fit is None:
         raise seen.not_moving("the surroundings do not show how the platform turns")
-    if fit.sigma > _GOOD_FIT_M:
+    # A long lever arm that nobody gave can turn accelerations round: only with a mounting that is known the sign is in question.
+    if fit.sigma > _GOOD_FIT_M and seen.config.extrinsic_estimation == "off":
         _check_sign(seen, path, fit)
     if fit.sigma > _LARGEST_MISFIT_M:
         raise seen.not_moving(f"LiDAR and IMU do not fit better than {fit.sigma * 100:.1f} cm")
