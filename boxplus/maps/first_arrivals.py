@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.maps.ikd_tree import IkdTree
-from boxplus.maps.known_planes import KnownPlanes, place_of
 
 _SOON_NS = 1_000_000_000
 _INDEX_BITS = np.uint64(20)
@@ -30,7 +29,7 @@ _INDEX = np.int64(0xFFFFF)
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)  # an odd factor whose product's upper bits depend on all bits of a key
 _EMPTY = np.uint32(0xFFFFFFFF)
 _ONE = np.uint64(1)
-_TAKEN_BITS, _NO_CELL = 16, np.uint64(0xFFFFFFFFFFFFFFFF)
+_TAKEN_BITS, _UPPER, _NO_CELL = 16, np.uint64(48), np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
 @kernel
@@ -70,18 +69,23 @@ def _meet(
             waited[n] = met[table[slot]] = True
 
 
+@kernel(inline=True)
+def _place_of(cell: np.uint64) -> np.uint64:
+    return np.uint64((cell * _SPREAD) >> _UPPER)
+
+
 @kernel
 def _are_taken(cells: NDArray[np.uint64], table: NDArray[np.uint64], taken: NDArray[np.bool_]) -> None:
     """Which of `cells` (n,) are in the table of those that hold a point."""
     for n in range(len(cells)):
-        taken[n] = table[place_of(cells[n], len(table))] == cells[n]
+        taken[n] = table[_place_of(cells[n])] == cells[n]
 
 
 @kernel
 def _take(cells: NDArray[np.uint64], table: NDArray[np.uint64]) -> None:
     """`cells` (n,) hold a point from now on."""
     for n in range(len(cells)):
-        table[place_of(cells[n], len(table))] = cells[n]
+        table[_place_of(cells[n])] = cells[n]
 
 
 class FirstArrivals:
@@ -89,13 +93,9 @@ class FirstArrivals:
 
     Args:
         largest_cell: side of the map's cells, which may be halved from scan to scan [m].
-
-    Attributes:
-        planes: of the map, for its measurements; where a scan changes the map they are forgotten.
     """
 
     def __init__(self, largest_cell: float) -> None:
-        self.planes = KnownPlanes()
         self._largest_cell = largest_cell
         self._cells = np.empty(0, np.uint64)
         self._points = np.empty((0, 3))
@@ -104,7 +104,6 @@ class FirstArrivals:
 
     def forget_map(self) -> None:
         """The map has lost points otherwise than here: nothing is known of its cells."""
-        self.planes.forget_all()
         self._taken[:] = _NO_CELL
 
     def insert_into(self, tree: IkdTree, p_world: NDArray[np.float64], time_ns: int) -> tuple[int, int]:
@@ -121,7 +120,6 @@ class FirstArrivals:
             self._taken_side = side
         cells = self._in_cells(p_world, side)
         waited, again = self._seen_again(cells)
-        self.planes.forget_near(self._points[again])
         tree.delete_points(self._points[again])
         self._keep(~again)
         taken = np.empty(len(cells), np.bool_)
@@ -129,7 +127,6 @@ class FirstArrivals:
         asked = np.flatnonzero(~taken | waited)
         stored = asked[tree.insert(p_world[asked], downsample=True).stored]
         _take(cells[asked], self._taken)
-        self.planes.forget_near(p_world[stored])
         first = stored[~waited[stored]]
         self._cells = np.concatenate([self._cells, cells[first]])
         self._points = np.concatenate([self._points, p_world[first]])

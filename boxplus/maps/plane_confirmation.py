@@ -19,7 +19,7 @@ from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
 from boxplus.filtering.plane_information import UNCONFIRMED, USED, pose_row
 from boxplus.maps.ikd_tree.search import IkdView, copy_found, has_within, knn
-from boxplus.maps.known_planes import WEIGHT
+from boxplus.maps.plane_matching import WEIGHT
 
 CONFIRMING = 25
 LEVERAGE = 3.0  # times the mean: about one plane in twenty exceeds it

@@ -11,9 +11,14 @@ from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
 from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, ONE_LINE, USED
 from boxplus.maps.ikd_tree.search import IkdView, copy_found, knn, knn5
-from boxplus.maps.known_planes import NEIGHBOURS, NO_CELL, PLANE, SPREAD, key_of, place_of
 from boxplus.maps.plane_fit import fit_plane_into
 
+NEIGHBOURS = 5
+# A matched plane: unit normal u (0 to 2), offset uᵀq in the world (3), variance of its points about it (4), and twice a
+# vector g with its offset gᵀq (5 to 8, 9 to 12): the uncertainty of the normal, see `_normal_uncertainty`; and the variance of
+# a point that counts for that uncertainty (13), here the plane's own; the weight that it was given last (WEIGHT).
+WEIGHT = 14
+PLANE = 15
 # Where one ring of the LiDAR alone has seen a surface, the five points lie on a line, and range noise makes them span the
 # plane of the beams: it would tie the sensor to its own scan pattern. Far away, where such a plane has the longest lever and
 # the rings lie far apart, the neighbours must spread across their longest extent by this variance [m²].
@@ -42,11 +47,6 @@ def match_planes(
     max_distance_sq: float,
     plane_threshold: float,
     warm: bool,
-    cell: float,
-    known_keys: NDArray[np.uint64],
-    known_planes: NDArray[np.float64],
-    known_neighbours: NDArray[np.float32],
-    cells: NDArray[np.uint64],
     neighbours: NDArray[np.float32],
     planes: NDArray[np.float64],
     fate: NDArray[np.uint8],
@@ -55,8 +55,6 @@ def match_planes(
 ) -> None:
     """Match the points [begin, end): five nearest map points, then the plane through them, or, where they lie on a line, fifteen.
 
-    Where a plane is known in the cell of a point and the point lies on it, that is its plane (`known_planes`).
-
     Args:
         view, origin: the map; its coordinates are relative to `origin` (3,).
         x: (36,) state that places the points in the world.
@@ -64,8 +62,6 @@ def match_planes(
         max_distance_sq: squared distance the fifth neighbour may have [m²].
         plane_threshold: largest distance of a neighbour from the plane [m].
         warm: `neighbours` holds the result of an earlier call on the same map: their distances bound the search.
-        cell, known_keys, known_planes, known_neighbours: a table of `KnownPlanes`.
-        cells: (n,) receives the keys of cells whose plane was searched and found, NO_CELL for the others.
         neighbours: (n, 5, 3), relative to `origin`.
         planes: (n, PLANE) receives the planes.
         fate: (n,) receives USED, FEW_NEIGHBOURS, NOT_A_PLANE or ONE_LINE.
@@ -82,33 +78,15 @@ def match_planes(
         yx = x[R] * sx + x[R + 1] * sy + x[R + 2] * sz + x[P] - origin[0]
         yy = x[R + 3] * sx + x[R + 4] * sy + x[R + 5] * sz + x[P + 1] - origin[1]
         yz = x[R + 6] * sx + x[R + 7] * sy + x[R + 8] * sz + x[P + 2] - origin[2]
-        rx = x[R] * (sx - x[PL]) + x[R + 1] * (sy - x[PL + 1]) + x[R + 2] * (sz - x[PL + 2])
-        ry = x[R + 3] * (sx - x[PL]) + x[R + 4] * (sy - x[PL + 1]) + x[R + 5] * (sz - x[PL + 2])
-        rz = x[R + 6] * (sx - x[PL]) + x[R + 7] * (sy - x[PL + 1]) + x[R + 8] * (sz - x[PL + 2])
-        near, plane = neighbours[n], planes[n]
-        wx, wy, wz = yx + origin[0], yy + origin[1], yz + origin[2]
-        key = key_of(np.int64(math.floor(wx / cell)), np.int64(math.floor(wy / cell)), np.int64(math.floor(wz / cell)))
-        place = place_of(key, len(known_keys))
-        if known_keys[place] == key:
-            known = known_planes[place]
-            off = known[0] * wx + known[1] * wy + known[2] * wz - known[3]
-            if abs(off) <= plane_threshold and not _lies_on_line(known[0], known[1], known[2], known[SPREAD], rx, ry, rz):
-                for column in range(PLANE):
-                    plane[column] = known[column]
-                for i in range(NEIGHBOURS):
-                    for axis in range(3):
-                        near[i, axis] = known_neighbours[place, i, axis]
-                fate[n], cells[n] = USED, NO_CELL
-                continue
-        cells[n] = NO_CELL
+        near = neighbours[n]
         # Five points of the map bound the search: those of an earlier call, or those of the point before, which is near by.
-        earlier = n if warm else n - 1
+        known = n if warm else n - 1
         qx, qy, qz = np.float32(yx), np.float32(yy), np.float32(yz)  # far from the origin, rounding exceeds the slack
         bound = max_distance_sq
-        if (warm or n > begin) and fate[earlier] != FEW_NEIGHBOURS:
+        if (warm or n > begin) and fate[known] != FEW_NEIGHBOURS:
             farthest = 0.0
             for i in range(NEIGHBOURS):
-                dx, dy, dz = neighbours[earlier, i, 0] - qx, neighbours[earlier, i, 1] - qy, neighbours[earlier, i, 2] - qz
+                dx, dy, dz = neighbours[known, i, 0] - qx, neighbours[known, i, 1] - qy, neighbours[known, i, 2] - qz
                 farthest = max(farthest, np.float64(dx * dx + dy * dy + dz * dz))
             bound = min(bound, farthest * _SLACK)
         count = knn5(view, qx, qy, qz, np.float32(bound), near, found_sq, stack)
@@ -118,24 +96,25 @@ def match_planes(
         if not fit_plane_into(near, NEIGHBOURS, plane_threshold, fit):
             fate[n] = NOT_A_PLANE
             continue
-        on_line = _lies_on_line(fit[0], fit[1], fit[2], fit[8] / NEIGHBOURS, rx, ry, rz)
+        rx = x[R] * (sx - x[PL]) + x[R + 1] * (sy - x[PL + 1]) + x[R + 2] * (sz - x[PL + 2])
+        ry = x[R + 3] * (sx - x[PL]) + x[R + 4] * (sy - x[PL + 1]) + x[R + 5] * (sz - x[PL + 2])
+        rz = x[R + 6] * (sx - x[PL]) + x[R + 7] * (sy - x[PL + 1]) + x[R + 8] * (sz - x[PL + 2])
+        on_line = _lies_on_line(fit, NEIGHBOURS, rx, ry, rz)
         fitted = near
         if on_line:
             found = knn(view, qx, qy, qz, np.float32(max_distance_sq), many_sq, stack)
             if found == MANY:
                 copy_found(view, stack, MANY, MANY, many)
-                on_line = not fit_plane_into(many, MANY, plane_threshold, fit) or _lies_on_line(
-                    fit[0], fit[1], fit[2], fit[8] / MANY, rx, ry, rz
-                )
+                on_line = not fit_plane_into(many, MANY, plane_threshold, fit) or _lies_on_line(fit, MANY, rx, ry, rz)
                 fitted = many
         if on_line:
             fate[n] = ONE_LINE
             continue
-        fate[n], cells[n] = USED, key
+        fate[n] = USED
+        plane = planes[n]
         plane[0], plane[1], plane[2] = fit[0], fit[1], fit[2]
         plane[3] = fit[3] + fit[0] * origin[0] + fit[1] * origin[1] + fit[2] * origin[2]
         plane[4] = plane[13] = fit[7]
-        plane[SPREAD] = fit[8] / len(fitted)
         _normal_uncertainty(fitted, fit, plane)
         for g in (5, 9):
             plane[g + 3] = (
@@ -144,11 +123,11 @@ def match_planes(
 
 
 @kernel(inline=True)
-def _lies_on_line(ux: float, uy: float, uz: float, spread: float, rx: float, ry: float, rz: float) -> bool:
-    """Whether the points of a plane are those of one scan line, given its normal, SPREAD and the ray (3,) from the sensor."""
+def _lies_on_line(fit: NDArray[np.float64], count: int, rx: float, ry: float, rz: float) -> bool:
+    """Whether the points of a plane are those of one scan line, given the ray (3,) from the sensor to it."""
     range_sq = rx * rx + ry * ry + rz * rz
-    along_normal = ux * rx + uy * ry + uz * rz
-    too_thin = spread < _MIN_SPREAD * min(1.0, range_sq * range_sq / _FAR**4)
+    along_normal = fit[0] * rx + fit[1] * ry + fit[2] * rz
+    too_thin = fit[8] < _MIN_SPREAD * count * min(1.0, range_sq * range_sq / _FAR**4)
     return bool(too_thin or along_normal * along_normal < _GRAZING * _GRAZING * range_sq)
 
 

@@ -30,14 +30,12 @@ from boxplus.filtering.small_linalg import cholesky_inverse_into
 from boxplus.maps.curved_patches import FILLED_CELLS, MEAN_LEVERAGE, PATCH, bend_planes
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
-from boxplus.maps.known_planes import NEIGHBOURS, PLANE, KnownPlanes
 from boxplus.maps.plane_confirmation import CONFIRMING, DENSE_CELLS, LEVERAGE, confirm_planes
-from boxplus.maps.plane_matching import MANY, match_planes, settle_normals
+from boxplus.maps.plane_matching import MANY, NEIGHBOURS, PLANE, match_planes, settle_normals
 from boxplus.maps.registration_config import RegistrationConfig
 
 _CHUNK = 1024
 _SAME_NEIGHBOURS = 0.05  # cells of the map a point may move and keep its neighbours
-_NOTHING_KNOWN = KnownPlanes(bits=0)
 REASONS = {
     FEW_NEIGHBOURS: "fewer than five map points near",
     NOT_A_PLANE: "neighbours not on a plane",
@@ -58,7 +56,6 @@ class PlaneMeasurement:
         weight: factor of the information, below 1 where the points are not where they seem.
         confirm: whether planes on which something hangs are held against more of the map: false ones are refused
             (`plane_confirmation`), curved ones bent (`curved_patches`).
-        known: planes that earlier scans have found in this map; those of this one come to them.
 
     Attributes:
         lever_arm: root mean square distance of the points from the LiDAR [m], 0.1 at least.
@@ -74,7 +71,6 @@ class PlaneMeasurement:
         with_extrinsic: bool,
         weight: float = 1.0,
         confirm: bool = False,
-        known: KnownPlanes | None = None,
     ) -> None:
         n = len(p_lidar)
         self._p_lidar = p_lidar
@@ -84,9 +80,6 @@ class PlaneMeasurement:
         self._with_extrinsic = with_extrinsic
         self._weight = weight
         self._confirm = confirm
-        self._known = known
-        if known is not None:
-            known.use_cells(self._cell)
         self._neighbours = np.zeros((n, NEIGHBOURS, 3), dtype=np.float32)
         self._planes = np.zeros((n, PLANE))
         self._fate = np.zeros(n, dtype=np.uint8)
@@ -230,8 +223,7 @@ class PlaneMeasurement:
 
     def _match(self, x: NDArray[np.float64]) -> None:
         view, origin, config = self._tree.view(), self._tree.origin, self._config
-        warm, known = self._matched, self._known or _NOTHING_KNOWN
-        cells = np.empty(self.points, np.uint64)
+        warm = self._matched
 
         def work(_: int, begin: int, end: int) -> None:
             match_planes(
@@ -244,11 +236,6 @@ class PlaneMeasurement:
                 config.max_neighbour_distance**2,
                 config.plane_threshold,
                 warm,
-                known.cell,
-                known.keys,
-                known.planes,
-                known.neighbours,
-                cells,
                 self._neighbours,
                 self._planes,
                 self._fate,
@@ -258,8 +245,6 @@ class PlaneMeasurement:
 
         run_chunks(work, len(self._p_lidar), _CHUNK, config.threads)
         self._matched = True
-        if self._known is not None:
-            self._known.remember(cells, self._planes, self._neighbours)
         settle_normals(x, self._p_lidar, config.plane_threshold, self._planes, self._fate)
         self._matched_at = x.copy()
 

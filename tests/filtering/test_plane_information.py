@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from boxplus.filtering.nav_state import MEASURED, TANGENT, NavState
 from boxplus.filtering.plane_information import FEW_NEIGHBOURS, GATED, NOT_A_PLANE, USED, accumulate_planes
-from boxplus.maps.known_planes import PLANE
+from boxplus.maps.plane_matching import PLANE
 from tests.filtering.random_states import derivative, random_state
 
 seeds = st.integers(0, 2**32 - 1)

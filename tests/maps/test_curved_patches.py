@@ -12,7 +12,7 @@ from boxplus.manifolds import so3
 from boxplus.maps.curved_patches import PATCH, bend_planes
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
-from boxplus.maps.known_planes import PLANE, WEIGHT
+from boxplus.maps.plane_matching import PLANE, WEIGHT
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
 

@@ -13,13 +13,11 @@ from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, ONE
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
-from boxplus.maps.known_planes import NEIGHBOURS, NO_CELL, PLANE, KnownPlanes
-from boxplus.maps.plane_matching import MANY, match_planes, settle_normals
+from boxplus.maps.plane_matching import MANY, NEIGHBOURS, PLANE, match_planes, settle_normals
 
 MAX_DISTANCE = 0.8
 THRESHOLD = 0.1
 GRAZING = 0.04  # sine of the least angle between a ray and the plane it hits
-NOTHING_KNOWN = KnownPlanes(bits=0)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -46,11 +44,6 @@ def _match(tree: IkdTree, x: NavState, points: np.ndarray, into: Match | None = 
         MAX_DISTANCE**2,
         THRESHOLD,
         into is not None,
-        NOTHING_KNOWN.cell,
-        NOTHING_KNOWN.keys,
-        NOTHING_KNOWN.planes,
-        NOTHING_KNOWN.neighbours,
-        np.full(len(points), NO_CELL),
         match.neighbours,
         match.planes,
         match.fate,

@@ -341,11 +341,9 @@ class LidarInertialOdometry(Snapshots):
         return points, map_points
 
     def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:
-        with_extrinsic, known = self.config.extrinsic_estimation != "off", self._arrivals.planes
+        with_extrinsic = self.config.extrinsic_estimation != "off"
         weight = _BLIND_WEIGHT if self._is_blind(frame) else 1.0
-        return PlaneMeasurement(
-            points, self.map, self.config, with_extrinsic=with_extrinsic, weight=weight, confirm=True, known=known
-        )
+        return PlaneMeasurement(points, self.map, self.config, with_extrinsic=with_extrinsic, weight=weight, confirm=True)
 
     def _is_blind(self, frame: Frame) -> bool:
         return frame.largest_gap_s > self.config.max_imu_gap

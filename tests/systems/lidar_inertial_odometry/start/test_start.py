@@ -19,7 +19,8 @@ from boxplus.sensors.sequencer import Frame
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, simulate
 from boxplus.simulation.faults import flip_accel
 from boxplus.simulation.motions import manoeuvres, trajectories
-from boxplus.simulation.motions.spline import Trajectory
+from boxplus.simulation.motions.spline import SplineTrajectory, Trajectory
+from boxplus.simulation.motions.trajectories import START_NS, control_times, from_angles
 from boxplus.simulation.worlds import sites, worlds
 from boxplus.simulation.worlds.world import World, box
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
@@ -247,6 +248,18 @@ def test_a_turn_that_a_wall_does_not_show_is_no_rest(rate: float) -> None:
 def _shaken(frame: Frame, seed: int) -> Frame:
     noise = np.random.default_rng(seed).normal(size=frame.imu.accel.shape)
     return replace(frame, imu=ImuSamples(frame.imu.time_ns, frame.imu.gyro + 0.3 * noise, frame.imu.accel + 3.0 * noise))
+
+
+@pytest.mark.parametrize(("swing", "hertz"), [(0.4, 0.8), (0.25, 0.8), (0.2, 1.6)])
+def test_a_swing_that_ends_as_it_began_is_no_rest(swing: float, hertz: float) -> None:
+    """To and fro about the vertical, once or twice while the start is watched."""
+    time = control_times(3.0, 0.04)
+    yaw = swing * np.sin(2.0 * np.pi * hertz * time + 0.3)
+    R = from_angles(0.0 * yaw, 0.0 * yaw, yaw)
+    motion = SplineTrajectory(START_NS, 0.04, R, np.array([-3.0, -2.0, 1.5]) + R @ np.array([-0.3, 0.0, 0.0]))
+    simulation = _steady(motion)
+    found = find_start(frames(simulation.events()), config(simulation))
+    assert isinstance(found, Start) and found.kind == "moving"
 
 
 def test_too_few_scans_in_motion_are_refused_with_the_evidence() -> None:
