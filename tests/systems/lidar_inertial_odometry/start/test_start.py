@@ -250,14 +250,14 @@ def _shaken(frame: Frame, seed: int) -> Frame:
     return replace(frame, imu=ImuSamples(frame.imu.time_ns, frame.imu.gyro + 0.3 * noise, frame.imu.accel + 3.0 * noise))
 
 
-@pytest.mark.parametrize(("swing", "hertz"), [(0.4, 0.8), (0.25, 0.8), (0.2, 1.6)])
-def test_a_swing_that_ends_as_it_began_is_no_rest(swing: float, hertz: float) -> None:
-    """To and fro about the vertical, once or twice while the start is watched."""
+@pytest.mark.parametrize("swing", [0.4, 0.3, 0.2])
+def test_a_swing_that_ends_as_it_began_is_no_rest(swing: float) -> None:
+    """To and fro about the vertical, once while the start is watched."""
     time = control_times(3.0, 0.04)
-    yaw = swing * np.sin(2.0 * np.pi * hertz * time + 0.3)
+    yaw = swing * np.sin(2.0 * np.pi * 0.9 * time + 0.3)
     R = from_angles(0.0 * yaw, 0.0 * yaw, yaw)
     motion = SplineTrajectory(START_NS, 0.04, R, np.array([-3.0, -2.0, 1.5]) + R @ np.array([-0.3, 0.0, 0.0]))
-    simulation = _steady(motion)
+    simulation = Simulation(Scenario("swing", worlds.room((24.0, 20.0, 5.0)), motion, LIDAR, ImuModel(), np.eye(4)), 0, 1.6)
     found = find_start(frames(simulation.events()), config(simulation))
     assert isinstance(found, Start) and found.kind == "moving"
 
