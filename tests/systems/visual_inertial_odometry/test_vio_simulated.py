@@ -218,6 +218,23 @@ def test_what_cannot_be_used_is_refused_or_counted() -> None:
     assert vio.counters == {"IMU sample not finite": 1, "IMU sample out of order": 1}
 
 
+@pytest.mark.parametrize("block", [1, 60])
+def test_samples_that_are_no_measurements_are_counted_by_reason(block: int) -> None:
+    flight = Flight(1, 1.0)
+    vio = VisualInertialOdometry(CONFIG, rig(), SimulatedTracker(flight, rig()))
+    gyro, accel = flight.gyro[:60].copy(), flight.accel[:60].copy()
+    gyro[30] += 40.0
+    gyro[40] = accel[40] = 0.0
+    accel[50, 1] = 1e6
+    for k in range(0, 60, block):
+        vio.push_imu(flight.time_ns[k : k + block], gyro[k : k + block], accel[k : k + block])
+    assert vio.counters == {
+        "IMU sample unlike both of its neighbours": 1,
+        "IMU sample of zeros": 1,
+        "IMU sample beyond any sensor": 1,
+    }
+
+
 def test_what_waits_for_a_start_is_bounded_and_no_older_sample_is_weighed() -> None:
     flight, one = Flight(4, 9.0), rig(1)
     vio = VisualInertialOdometry(VioConfig(pixel_sigma=PIXEL_SIGMA, start_duration=0.5), one)
