@@ -16,8 +16,11 @@ import numba
 
 _PACKAGE_ROOT = os.path.dirname(os.path.realpath(__file__))
 _IMPORT = re.compile(
-    r"^\s*(?:from\s+((?:boxplus|\.)[\w.]*)\s+import\s+(\([^)]*\)|[^\n]*)|import\s+(boxplus[\w.]+))", re.MULTILINE
+    r"^\s*(?:from\s+((?:boxplus|\.)[\w.]*)\s+import\s+"
+    r"(\([^)#]*(?:#[^\n]*\n[^)#]*)*\)|[^\n#\\]*(?:\\\r?\n[^\n#\\]*)*)|import\s+(boxplus[\w.]+))",
+    re.MULTILINE,
 )
+_BESIDE_NAMES = re.compile(r"#[^\n]*|[()\\]")  # comments, brackets, lines that go on
 
 
 @functools.cache
@@ -65,7 +68,8 @@ def _source(file: str) -> tuple[bytes, frozenset[str]]:
                 continue
             package = ".".join(["boxplus", *place[:-1]]) + package.rstrip(".")
         candidates = [module] if module else [package]
-        candidates += [f"{package}.{name.split(' as ')[0].strip()}" for name in names.strip("()").split(",") if package]
+        for name in _BESIDE_NAMES.sub("", names).split(",") if package else ():
+            candidates.append(f"{package}.{name.split(' as ')[0].strip()}")
         for candidate in candidates:
             found.update(_module_files(candidate))
     name = file.replace(os.sep, "/") if place is None else "/".join(place)
