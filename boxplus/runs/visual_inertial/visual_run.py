@@ -17,9 +17,9 @@ from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
 from boxplus.runs.cameras.camera_run import CameraRun
 from boxplus.runs.cameras.causes import BEFORE_S, MAY_BE, calibration_doubts, likely_causes
 from boxplus.runs.cameras.folder import VioFolder, claim_camera_folder
+from boxplus.runs.cameras.image_gaps import ImageGaps
 from boxplus.runs.cameras.landmark_file import LandmarkFile, LandmarksById, write_lines
 from boxplus.runs.cameras.turning import Turning
-from boxplus.runs.estimate_statistics import GapWatch
 from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_loop import Progress
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
@@ -133,7 +133,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         self._troubled_ns: int | None = None
         self._causes: list[str] = []
         self._doubts: list[str] = []
-        self._turning, self._image_gaps = Turning(BEFORE_S), GapWatch()
+        self._turning, self._image_gaps = Turning(BEFORE_S), ImageGaps()
         self._longest_gap_s = config.odometry.max_imu_gap
 
     def open(self, stack: ExitStack) -> None:
@@ -184,7 +184,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         if isinstance(event, CameraImage):
             self._images[event.camera] += 1
             if event.camera == 0:
-                self._image_gaps.add(np.array([event.time_ns], np.int64))
+                self._image_gaps.add(event.time_ns)
             estimates = self._odometry.push_image(event) if event.camera < len(self._rig.cameras) else []
         else:
             self.counts.add_imu(event.time_ns)
