@@ -1,4 +1,4 @@
-"""Why one camera finds no start while it only turns: no depth is seen before it moves sideways."""
+"""Why one camera finds no start while it only turns, or sees only what is far away: no depth is seen without parallax."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ _PARALLAX = 0.0075  # rad
 
 
 def turn_on_the_spot(seen: Sequence[Tracks], focal_px: float) -> str | None:
-    """What the corners of one camera say where it turned and nothing else; None where it did something else.
+    """What the corners of one camera say where it turned and they moved as a turn moves them; None where they did otherwise.
 
     Args:
         seen: frames in order of time.
         focal_px: of the camera; numbers are told in its pixels.
     """
-    pairs = np.array(list(_pairs(seen)))
-    if not len(pairs):
+    pairs = list(_pairs(seen))
+    turning = [pair for pair in pairs if pair[0] >= _MOVED]
+    if not turning or max(left for _, left in pairs) > _PARALLAX:
         return None
-    moved, left = pairs.max(axis=0)
-    if moved < _MOVED or left > _PARALLAX:
-        return None
+    moved, left = max(turning, key=lambda pair: pair[1])
     return (
         f"in half a second corners move by {focal_px * moved:.1f} px, of which a rotation leaves {focal_px * left:.1f} px of "
-        f"parallax ({focal_px * _PARALLAX:.1f} are needed): the camera turns on the spot, and has to move sideways"
+        f"parallax ({focal_px * _PARALLAX:.1f} are needed): the camera turns on the spot, or all that it sees is far away; it "
+        "has to move sideways near something"
     )
 
 
