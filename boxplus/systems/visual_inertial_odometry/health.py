@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
-from boxplus.systems.visual_inertial_odometry.corners.partners import FLAT, LEAST_SHARE, few_are_found, share_found
+from boxplus.systems.visual_inertial_odometry.corners.partners import FLAT, LEAST_SHARE, few_are_found
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.estimate import Status
 from boxplus.systems.visual_inertial_odometry.observations import Fit
@@ -124,9 +124,8 @@ class Health:
                 f"landmarks fit to {self._fit_ratio * self.config.pixel_sigma:.1f} px, where {self.config.pixel_sigma:g} px are "
                 "expected: check the calibration of the cameras"
             )
-        partners = share_found(tracks)
-        if partners is not None:
-            self._partners += new * (partners - self._partners)
+        if tracks.partners is not None:
+            self._partners += new * (tracks.partners.share - self._partners)
         if self._partners < LEAST_SHARE:
             sentences.append(few_are_found(self._partners))
         return sentences

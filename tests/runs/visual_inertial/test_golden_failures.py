@@ -6,6 +6,7 @@ All are hand-held walks in full motion from the first image on, of a camera with
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -15,10 +16,12 @@ import pytest
 from boxplus.errors import InputError
 from boxplus.evaluation.evaluation import evaluate
 from boxplus.formats.trajectory import Trajectory, read_trajectory
-from boxplus.manifolds import quaternion
+from boxplus.manifolds import quaternion, so3
 from boxplus.runs.visual_inertial.config import VioRunConfig
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
+from boxplus.sensors.camera_image import CameraImage
 from boxplus.simulation.cameras import CameraFault, as_camera_recording, faults, make_rig, simulate_cameras
+from boxplus.simulation.cameras.sensor import CameraRig
 
 pytestmark = [
     pytest.mark.slow,
@@ -26,7 +29,7 @@ pytestmark = [
 ]
 CONFIG = VioRunConfig.model_validate({"odometry": {"cell_size": 12, "features": 100}})
 SEED = 3
-Rig = Literal["stereo", "mono"]
+Rig = Literal["stereo", "mono"] | CameraRig
 Faulty = tuple[CameraFault, Rig, float, float]
 
 
@@ -47,7 +50,8 @@ class Outcome(NamedTuple):
 
 
 def run(folder: Path, fault: CameraFault | None, rig: Rig, seconds: float, rate_hz: float, seed: int = SEED) -> Outcome:
-    simulation = simulate_cameras("room_moving", seed, duration_s=seconds, rig=make_rig(rig, None, 0.3, rate_hz))
+    made = rig if isinstance(rig, CameraRig) else make_rig(rig, None, 0.3, rate_hz)
+    simulation = simulate_cameras("room_moving", seed, duration_s=seconds, rig=made)
     try:
         with as_camera_recording(simulation, fault) as recording:
             summary = run_visual_odometry(recording, folder / "run", CONFIG)
@@ -70,6 +74,34 @@ def name(value: object) -> str | None:
 def test_a_sound_recording_says_nothing(tmp_path: Path) -> None:
     sound = run(tmp_path, None, "stereo", 6.0, 10.0)
     assert sound.end == "finished" and not sound.said and not sound.lost and sound.error < 0.01
+
+
+@pytest.mark.parametrize(("yaw_deg", "baseline"), [(75.0, 0.11), (0.0, 1.1)])
+def test_a_pair_that_shares_little_of_its_view_or_stands_far_apart_is_as_sound(
+    tmp_path: Path, yaw_deg: float, baseline: float
+) -> None:
+    rig = make_rig("stereo", None, 0.3, 10.0)
+    T = np.array(rig.cameras[1].T_imu_camera)
+    T[:3, :3] = T[:3, :3] @ so3.exp(np.array([0.0, np.deg2rad(yaw_deg), 0.0]))
+    T[:3, 3] = np.array(rig.cameras[0].T_imu_camera)[:3, 3] - [0.0, baseline, 0.0]
+    second = rig.cameras[1].model_copy(update={"T_imu_camera": T})
+    outcome = run(tmp_path, None, rig.model_copy(update={"cameras": (rig.cameras[0], second)}), 6.0, 10.0)
+    assert outcome.end == "finished" and not outcome.said and not outcome.lost and outcome.error < 0.01, outcome
+
+
+def test_a_rate_that_falls_is_no_gap(tmp_path: Path) -> None:
+    def slower(incoming: Iterable[faults.Event]) -> Iterator[faults.Event]:
+        images = 0
+        for event in incoming:
+            if isinstance(event, CameraImage):
+                images += 1
+                if images > 90 and images % 4:
+                    continue
+            yield event
+
+    fault = CameraFault("slower", "30 Hz, then 7.5 Hz", ("gap",), "estimator", events=slower)
+    outcome = run(tmp_path, fault, "mono", 6.0, 30.0)
+    assert outcome.end == "finished" and "gap" not in outcome.said and outcome.error < 0.02, outcome
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import numpy as np
 from boxplus.errors import SingularProblemError
 from boxplus.systems.visual_inertial_odometry import VioConfig
 from boxplus.systems.visual_inertial_odometry.beginning import covariance_of
+from boxplus.systems.visual_inertial_odometry.corners.partners import Partners
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.health import Health, position_sigma
 from boxplus.systems.visual_inertial_odometry.observations import Fit
@@ -55,10 +56,20 @@ def test_landmarks_that_are_elsewhere_name_the_baseline_where_there_is_one() -> 
         health.begin(0)
         for k in range(1, 80):
             tracks = frame(k)
-            seen = replace(tracks, pixels=np.zeros((40, cameras, 2)), contrast=np.full(cameras, 40.0))
+            seen = replace(tracks, pixels=np.zeros((40, cameras, 2)))
             health.judge(seen, wrong, False, 0.005, 0.01)
         assert health.contradiction is not None and "of the landmarks seen are not where they should be" in health.contradiction
         assert ("baseline" in health.contradiction) == named
+
+
+def test_corners_that_a_second_camera_does_not_find_contradict_and_no_judgement_does_not() -> None:
+    for partners, named in ((Partners(0.03), True), (Partners(0.6), False), (None, False)):
+        health = Health(VioConfig())
+        health.begin(0)
+        for k in range(1, 80):
+            health.judge(replace(frame(k), partners=partners), fit(), False, 0.005, 0.01)
+        assert (health.contradiction is not None) == named
+        assert not named or "of the corners are found in a second camera" in str(health.contradiction)
 
 
 def test_a_pose_that_nothing_determines_is_lost() -> None:

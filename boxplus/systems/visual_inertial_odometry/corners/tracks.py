@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.systems.visual_inertial_odometry.corners.partners import Partners
 from boxplus.systems.visual_inertial_odometry.lines.tracks import LineTracks
 
 _MOST = 0.8
@@ -28,6 +29,8 @@ class Tracks:
         motion_px: median motion of the corners in the first camera since the image before [px]; NaN without any.
         brightness: (c,) mean grey value of each camera, NaN without an image.
         contrast: (c,) standard deviation of the grey values, NaN without an image.
+        partners: what shares the other cameras find of those that they should; None where too few tell it, an image shows
+            nothing, or there is one camera.
         lines: the lines seen beside the corners; None where none are looked for.
     """
 
@@ -40,6 +43,7 @@ class Tracks:
     motion_px: float
     brightness: NDArray[np.float64]
     contrast: NDArray[np.float64]
+    partners: Partners | None = None
     lines: LineTracks | None = None
 
     def __len__(self) -> int:

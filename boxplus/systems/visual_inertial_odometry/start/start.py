@@ -29,7 +29,7 @@ from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.imu_noise import sample_noise
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
-from boxplus.systems.visual_inertial_odometry.corners.partners import LEAST_SHARE, few_are_found, share_found
+from boxplus.systems.visual_inertial_odometry.corners.partners import swapped
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.gyro_bias import estimate_gyro_bias, stereo_points
@@ -173,9 +173,9 @@ def moving_start(seen: Sequence[Tracks], imu: ImuSamples, rig: Rig, config: VioC
     count = len(np.unique(tracks.track_of))
     if count < _FEWEST_TRACKS:
         return f"{count} corners were followed through {_FEWEST_SIGHTINGS} keyframes ({_FEWEST_TRACKS} are needed)"
-    shares = [share for share in map(share_found, seen) if share is not None]
-    if shares and np.mean(shares) < LEAST_SHARE:
-        return few_are_found(float(np.mean(shares)))
+    exchange = swapped(frame.partners for frame in seen)
+    if exchange is not None:
+        return exchange
 
     pixel = 1.0 / float(rig.cameras[0].model.parameters[0])
     stated = imu_noise(rig, config)

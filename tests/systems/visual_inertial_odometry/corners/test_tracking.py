@@ -13,6 +13,7 @@ from boxplus import InputError, Pinhole
 from boxplus.manifolds import so3
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig
 from boxplus.systems.visual_inertial_odometry.corners import tracking
+from boxplus.systems.visual_inertial_odometry.corners.partners import LEAST_SHARE, Partners
 from boxplus.systems.visual_inertial_odometry.corners.tracking import FeatureTracker
 from boxplus.systems.visual_inertial_odometry.corners.tracks import most_are_below
 
@@ -115,6 +116,32 @@ def test_a_second_image_that_does_not_belong_to_the_first_gives_no_partners() ->
     assert np.isfinite(swapped.pixels[:, 1, 0]).mean() < 0.1
     lower = tracker.track(1, {0: images[0], 1: np.roll(images[1], 6, axis=0)}, np.eye(3))
     assert np.isfinite(lower.pixels[:, 1, 0]).mean() < 0.2 and lower.rejected["off its epipolar line"] > 5
+
+
+def test_partners_are_asked_for_where_another_camera_should_see_them() -> None:
+    picture, config = wall(), VioConfig(features=80, cell_size=30)
+    images = pair(picture, np.eye(3), np.zeros(3))
+
+    def partners(rig: Rig, images: dict[int, np.ndarray]) -> Partners | None:
+        tracker = FeatureTracker(config, rig)
+        return tracker.detect(tracker.track(0, images, np.eye(3))).partners
+
+    sound = partners(stereo(), images)
+    assert sound is not None and sound.share > 0.9 and sound.exchanged is None
+    swapped = partners(stereo(), {0: images[1], 1: images[0]})
+    assert swapped is not None and swapped.share < LEAST_SHARE
+    assert swapped.exchanged is not None and swapped.exchanged > 0.9
+    strangers = partners(stereo(), {0: images[0], 1: seen(wall(7), np.eye(3), np.zeros(3))})
+    assert strangers is not None and strangers.share < LEAST_SHARE
+    assert strangers.exchanged is not None and strangers.exchanged < LEAST_SHARE
+    # Nothing is to be judged where views do not overlap, disparities are beyond what flow finds, or a camera shows nothing.
+    turned = mounting(BASELINE)
+    turned[:3, :3] = so3.exp(np.array([0.0, np.deg2rad(80.0), 0.0]))
+    assert partners(Rig.of([CAMERA] * 2, [mounting(0.0), turned], [SIZE] * 2), images) is None
+    wide = seen(picture, np.eye(3), np.array([1.2, 0.0, 0.0]))
+    assert partners(Rig.of([CAMERA] * 2, [mounting(0.0), mounting(1.2)], [SIZE] * 2), {0: images[0], 1: wide}) is None
+    assert partners(stereo(), {0: images[0], 1: np.full_like(images[1], 90)}) is None
+    assert partners(Rig.of([CAMERA], [mounting(0.0)], [SIZE]), {0: images[0]}) is None
 
 
 def test_without_an_image_or_in_the_dark_corners_are_lost_and_counted() -> None:
