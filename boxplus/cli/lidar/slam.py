@@ -104,11 +104,9 @@ def slam(
     from boxplus.cli.outcome import reported
     from boxplus.cli.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
-    from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
+    from boxplus.runs.slam.folder import claim_slam_folder
     from boxplus.runs.slam.slam_run import run_slam
 
-    if resume and not overwrite and SlamFolder(folder).stopped_before_its_first_checkpoint():
-        resume, overwrite = False, True
     terminal = RunTerminal(quiet=quiet, as_json=as_json)
     with reported(recording, folder, as_json=as_json) as outcome:
         truth = read_ground_truth(ground_truth)
@@ -118,8 +116,10 @@ def slam(
             open_recording(recording, run_config.recording) as opened,
             claim_slam_folder(folder, overwrite=overwrite, resume=resume) as claimed,
         ):
+            if resume and not claimed.can_go_on():
+                terminal.warn(f"{folder.name}: stopped before its first checkpoint: the run begins anew")
             extrinsic = None
-            if resume and claimed.odometry_is_finished():  # nothing is asked of its mounting any more
+            if resume and claimed.odometry_standing() == "finished":  # nothing is asked of its mounting any more
                 terminal.print_evidence(opened.info, opened.info.evidence)
             else:
                 extrinsic = find_mounting(terminal, opened, run_config.odometry, should_stop)

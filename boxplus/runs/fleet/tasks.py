@@ -166,7 +166,7 @@ def _changed_at(recording: Path) -> float:
 def _is_begun(folder: SlamFolder, config: SlamRunConfig) -> bool:
     if not folder.config.is_file() or folder.config.read_text(encoding="utf-8") != dump_slam_config(config):
         return False
-    return folder.odometry.checkpoint.is_file() or folder.odometry_is_finished()
+    return folder.can_go_on()
 
 
 def _key_of_pair(place: Store, names: tuple[str, str], config: SessionsConfig) -> str:

@@ -16,16 +16,18 @@ from boxplus.runs.storage.state_codec import is_of_this_program
 
 Standing = Literal["not begun", "stopped", "stopped before its first checkpoint", "stopped under another boxplus", "finished"]
 
+_PROGRAM = RunSummary.model_fields["program"].default
+
 
 def standing(folder: RunFolder) -> Standing:
     """How far a run of `boxplus lio` came in a folder, which may not be there.
 
     Raises:
-        InputError: a `run.json` of this command that cannot be read.
+        InputError: a `run.json` that cannot be read, unless it names another command.
     """
     if folder.checkpoint.is_file():
         return "stopped" if is_of_this_program(folder.checkpoint) else "stopped under another boxplus"
-    if not folder.summary.is_file() or program_of(folder.summary) != RunSummary.model_fields["program"].default:
+    if not folder.summary.is_file() or program_of(folder.summary) not in (_PROGRAM, None):
         return "not begun"
     return "finished" if read_summary(folder.summary).state == "finished" else "stopped before its first checkpoint"
 

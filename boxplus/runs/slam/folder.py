@@ -10,13 +10,14 @@ from pathlib import Path
 
 from boxplus.errors import InputError
 from boxplus.formats.output import EARLIER_SUFFIX, TEMPORARY_SUFFIX
-from boxplus.runs.lidar_inertial.summary import read_summary
+from boxplus.runs.lidar_inertial.earlier_run import Standing, standing
 from boxplus.runs.run_folder import RunFolder, is_map_file
 from boxplus.runs.slam.summary import read_slam_summary
 from boxplus.runs.storage.folder_lock import locked_folder
 from boxplus.runs.storage.output_folder import output_folder, program_of, refuse_both, state_of
 
 PROGRAM = "boxplus slam"
+_NOT_ENDED = ("running", "failed")  # one that was interrupted in good order has left a checkpoint, or has lost it since
 _LOCAL_MAP_FILE = re.compile(r"(\d{6,}|graph)\.npz")
 
 
@@ -67,10 +68,8 @@ class SlamFolder(RunFolder):
     @contextmanager
     def locked_to_resume(self, program: str) -> Iterator[None]:
         """See `OdometryFolder.locked_to_resume`; there is something to do where the odometry is finished, but not the run."""
-        is_left = self.odometry_is_finished() and (
-            not self.summary.is_file() or read_slam_summary(self.summary).state != "finished"
-        )
-        if not (is_left or self.odometry.checkpoint.is_file()):
+        is_finished = self.summary.is_file() and read_slam_summary(self.summary).state == "finished"
+        if not self.can_go_on() or (is_finished and not self.odometry.checkpoint.is_file()):
             raise InputError(
                 "the folder of a run of 'boxplus slam' that did not come to its end, with a checkpoint in odometry/",
                 f"none in {self.path}",
@@ -80,18 +79,39 @@ class SlamFolder(RunFolder):
             lock.keep_file = False
             yield
 
-    def odometry_is_finished(self) -> bool:
-        """Whether the odometry came to its end, and left everything that the rest needs."""
+    def odometry_standing(self) -> Standing:
+        """How far the odometry came.
+
+        Raises:
+            InputError: its `run.json` cannot be read.
+        """
         try:
-            return read_summary(self.odometry.summary).state == "finished"
-        except InputError:
-            return False
+            return standing(self.odometry)
+        except InputError as error:
+            raise InputError(
+                error.expected, error.got, "put the file of that run back, or replace the whole run with --overwrite"
+            ) from error
+
+    def can_go_on(self) -> bool:
+        """Whether a run left something to go on with: a checkpoint, or an odometry that is finished.
+
+        Raises:
+            InputError: see `odometry_standing`.
+        """
+        return self.odometry.checkpoint.is_file() or self.odometry_standing() == "finished"
 
     def stopped_before_its_first_checkpoint(self) -> bool:
-        """Whether a run of `boxplus slam` was begun here, is not finished, and left nothing that one could go on from."""
-        if self.odometry.checkpoint.is_file() or self.odometry_is_finished():
+        """Whether a run was begun here, neither ended nor left anything to go on with, and so can only begin anew.
+
+        Raises:
+            InputError: see `odometry_standing`.
+        """
+        if not self.summary.is_file() or program_of(self.summary) != PROGRAM or state_of(self.summary) not in _NOT_ENDED:
             return False
-        return self.summary.is_file() and program_of(self.summary) == PROGRAM and state_of(self.summary) != "finished"
+        found = self.odometry_standing()
+        if found == "not begun":  # but what is there without a summary of this odometry may be all of one
+            return not (self.odometry.summary.is_file() or self.odometry.holds_estimates())
+        return found == "stopped before its first checkpoint"
 
     def own_files(self) -> Iterator[Path]:
         """See `RunFolder.own_files`."""
@@ -125,18 +145,24 @@ def is_local_map_file(path: Path) -> bool:
 def claim_slam_folder(folder: str | Path, *, overwrite: bool = False, resume: bool = False) -> Iterator[SlamFolder]:
     """A folder to write a run into, locked while the block runs; see `claim_run_folder`.
 
+    To `resume` a run that was killed before there was anything to go on with, its folder is cleared, and the run begins anew:
+    `can_go_on` of what is yielded tells. Where anything of a finished odometry stands, all of it stays.
+
     Raises:
         InputError: another process is writing there; the folder holds something else, or an earlier run and `overwrite` is not
-            set; no run to resume; both are asked for.
+            set; no run to resume, or one whose `run.json` cannot be read; both are asked for.
         OutputError: it cannot be created or cleared.
     """
     refuse_both(overwrite, resume)
     slam = SlamFolder(Path(folder))
-    if resume:
+    begins_anew = resume and slam.stopped_before_its_first_checkpoint()
+    if resume and not begins_anew:
         with slam.locked_to_resume(PROGRAM):
             yield slam
         return
-    with output_folder(
-        slam.path, PROGRAM, slam.own_files, slam.own_folders, overwrite=overwrite, holds_results=slam.odometry.holds_estimates
-    ):
+
+    def holds_results() -> bool:  # asked again under the lock: another process may have gone on meanwhile
+        return not slam.stopped_before_its_first_checkpoint() if begins_anew else slam.odometry.holds_estimates()
+
+    with output_folder(slam.path, PROGRAM, slam.own_files, slam.own_folders, overwrite=overwrite, holds_results=holds_results):
         yield slam

@@ -68,7 +68,8 @@ def run_slam(
 
     Loops are looked for by a process of its own, whose result depends on the local maps alone. A run that was killed or
     interrupted goes on from the odometry's checkpoint, or, where that is finished, from what it left; the loops are looked for
-    again among the local maps on disk. Its results are those of a run without an interruption, to the bit.
+    again among the local maps on disk. Its results are those of a run without an interruption, to the bit. Where it was killed
+    before its first checkpoint, it begins anew.
 
     Args:
         recording: opened.
@@ -96,7 +97,7 @@ def run_slam(
     else:
         claimed = claim_slam_folder(folder, overwrite=overwrite, resume=resume)  # type: ignore[assignment]
     with claimed as own:
-        run = _Run(recording, own, config, resume, (forbidden or [], forced or []))
+        run = _Run(recording, own, config, resume and own.can_go_on(), (forbidden or [], forced or []))
         own_slam = config.slam if recording.info.imu_topic else config.slam.without_gravity()
         search = LoopSearch(own_slam, forbidden or [], forced or [], make_folder(own.local_maps), own.graph)
         return run.execute(search, extrinsic, progress or (lambda _: None), view, loop_view, should_stop or (lambda: False))
@@ -115,7 +116,7 @@ class _Run:
         text = dump_slam_config(config)
         if resume:
             self._resumed = _checked_to_go_on(folder, text)
-            if folder.odometry_is_finished():  # else its checkpoint says of which recording it is
+            if folder.odometry_standing() == "finished":  # else its checkpoint says of which recording it is
                 refuse_other_recording(folder.odometry, recording)
         with atomic_file(folder.config) as file:
             file.write(text.encode())
@@ -141,7 +142,7 @@ class _Run:
                     Beside(config.local_maps, LocalMapFolder(own.local_maps), spool, search, loop_view, has_gravity=self._has_imu)
                 ) as beside,
             ):
-                if self._resume and own.odometry_is_finished():
+                if self._resume and own.odometry_standing() == "finished":
                     odometry = self._finished_odometry(beside)
                 else:
                     odometry = run_odometry(
