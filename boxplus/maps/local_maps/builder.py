@@ -34,6 +34,11 @@ class _Seen:
 class LocalMapBuilder:
     """Collects scans until a stretch is long enough, and makes a `LocalMap` of it.
 
+    Args:
+        config: settings; each has a default.
+        looks_anew: where nobody says where up is, ask the surfaces of every map; otherwise the first that shows it tells it for
+            all later ones.
+
     Example:
         >>> import numpy as np
         >>> builder = LocalMapBuilder(LocalMapConfig(length=2.0))
@@ -45,12 +50,14 @@ class LocalMapBuilder:
         [5]
     """
 
-    def __init__(self, config: LocalMapConfig | None = None) -> None:
+    def __init__(self, config: LocalMapConfig | None = None, *, looks_anew: bool = False) -> None:
+        self._looks_anew = looks_anew
         self.config = as_settings(LocalMapConfig, config)
         self._seen: list[_Seen] = []
         self._last: _Seen | None = None  # the scan that the frame of the last map stands at
         self._T_odo_before: Floats | None = None
-        self._found_up: Floats | None = None  # where nobody said it
+        self._carried_up: Floats | None = None  # where nobody said it: what a map showed, before that the first one's guess
+        self._is_shown = False
         self._count = 0
 
     def push(
@@ -63,8 +70,9 @@ class LocalMapBuilder:
             T_odo_body: (7,) pose of the body in the odometry's world [qw, qx, qy, qz, x, y, z].
             covariance: (6, 6) of [w, v] [rad, m] on the right of that pose, against the first pose.
             p_body: (N, 3) its points in the body's frame [m]; none where nobody knows where they belong.
-            up_odo: (3,) against gravity, in the odometry's world. None where nobody knows: surfaces of the first map tell it,
-                within 45° of the z axis of the body there, and the odometry carries it on.
+            up_odo: (3,) against gravity, in the odometry's world. None where nobody knows: surfaces of the first map that shows
+                it tell, within 45° of the z axis of the body there, and the odometry carries it on; maps before stand as the body
+                did in the first of them (`LocalMap.is_level`).
 
         Raises:
             InputError: a time that is not later, arrays of another shape, not finite.
@@ -100,7 +108,8 @@ class LocalMapBuilder:
         """The map of the collected scans; the last of them begins the next one."""
         path = np.array([seen.path_m for seen in self._seen])
         middle = self._seen[int(np.argmin(np.abs(path - 0.5 * (path[0] + path[-1]))))]
-        T_odo_map = _level_frame(middle.T_odo_body, self._up_odo(middle))
+        up_odo, is_level = self._up_odo(middle)
+        T_odo_map = _level_frame(middle.T_odo_body, up_odo)
         points = np.concatenate([self._in_map(seen, T_odo_map) for seen in self._seen])
         points = points[first_per_voxel(points, self.config.voxel)]
         begin = self._seen[0].time_ns
@@ -114,6 +123,7 @@ class LocalMapBuilder:
             path_m=middle.path_m,
             points=np.ascontiguousarray(points),
             scans=len(self._seen),
+            is_level=is_level,
         )
         self._count += 1
         self._last, self._T_odo_before = middle, T_odo_map
@@ -122,16 +132,21 @@ class LocalMapBuilder:
         self._seen = [replace(newest, p_body=newest.p_body[:0])]
         return made
 
-    def _up_odo(self, middle: _Seen) -> Floats:
-        """(3,) as it was said, or as the collected scans show it."""
+    def _up_odo(self, middle: _Seen) -> tuple[Floats, bool]:
+        """(3,) as it was said, or as the collected scans show it, or earlier ones did; and whether it is more than a guess."""
         if middle.up_odo is not None:
-            return middle.up_odo
-        if self._found_up is None:
+            return middle.up_odo, True
+        up = self._carried_up
+        if up is None or not self._is_shown or self._looks_anew:
             here = middle.T_odo_body  # in whose frame coordinates are small
-            points = np.concatenate([self._in_map(seen, here) for seen in self._seen])
-            points = np.ascontiguousarray(points[first_per_voxel(points, self.config.voxel)])
-            self._found_up = quaternion.to_matrix(here[:4]) @ find_vertical(points, _UP)
-        return self._found_up
+            R_odo_here = quaternion.to_matrix(here[:4])
+            found = find_vertical(np.concatenate([self._in_map(seen, here) for seen in self._seen]), _UP)
+            if found is not None:
+                up, self._is_shown = R_odo_here @ found, True
+            elif up is None:
+                up = R_odo_here[:, 2]
+            self._carried_up = up
+        return up, self._is_shown
 
     @staticmethod
     def _in_map(seen: _Seen, T_odo_map: Floats) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file, make_folder
 from boxplus.maps.local_maps.local_map import LocalMap
 
-_FORMAT, _VERSION = "boxplus-local-map", 1
+_FORMAT, _VERSION = "boxplus-local-map", 2
 _NAME = re.compile(r"(\d{6,})\.npz")
 _NUMBERS = ("number", "time_ns", "begin_ns", "end_ns", "scans")
 _SHAPES = {"T_odo_map": (7,), "covariance": (6, 6), "path_m": ()}
@@ -46,7 +46,7 @@ class LocalMapFolder:
             OutputError: the disk is full or the folder cannot be written.
         """
         make_folder(self.path)
-        content = {name: getattr(local_map, name) for name in (*_NUMBERS, *_SHAPES, "points")}
+        content = {name: getattr(local_map, name) for name in (*_NUMBERS, *_SHAPES, "is_level", "points")}
         with atomic_file(self.file(local_map.number)) as file:
             np.savez(file, format=np.array(_FORMAT), version=np.array(_VERSION), **content)
 
@@ -63,7 +63,7 @@ class LocalMapFolder:
                     raise ValueError(f"format {stored['format']}, version {stored['version']}")
                 numbers: dict[str, Any] = {name: int(stored[name]) for name in _NUMBERS}
                 arrays: dict[str, Any] = {name: np.asarray(stored[name], dtype=np.float64) for name in _SHAPES}
-                points = stored["points"]
+                points, is_level = stored["points"], bool(stored["is_level"])
             fits = all(arrays[name].shape == shape and np.isfinite(arrays[name]).all() for name, shape in _SHAPES.items())
             if not fits or points.ndim != 2 or points.shape[1] != 3 or points.dtype != np.float32 or numbers["number"] != number:
                 raise ValueError("arrays of another shape, or another number")
@@ -73,4 +73,4 @@ class LocalMapFolder:
                 "leave it out, or run 'boxplus slam' again",
             ) from error  # fmt: skip
         path_m = float(arrays.pop("path_m"))
-        return LocalMap(**numbers, **arrays, path_m=path_m, points=points)
+        return LocalMap(**numbers, **arrays, path_m=path_m, points=points, is_level=is_level)

@@ -33,6 +33,7 @@ class LocalMap:
         path_m: way from the start of the odometry to the frame [m].
         points: (N, 3) float32 [m], map frame, one per voxel.
         scans: how many it was made of.
+        is_level: z is up; False where nobody said and nothing showed where up is: it stands as the body did when they began.
     """
 
     number: int
@@ -44,6 +45,7 @@ class LocalMap:
     path_m: float
     points: NDArray[np.float32]
     scans: int
+    is_level: bool = True
 
 
 def relative_covariance(covariance_before: ArrayLike, covariance_after: ArrayLike, T_before_after: ArrayLike) -> Floats:

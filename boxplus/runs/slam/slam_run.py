@@ -184,16 +184,21 @@ class _Run:
         return SlamResult(self._folder, summary, odometry, SlamOutcome(none, [], None), maps)
 
     def _write(self, odometry: RunSummary, outcome: SlamOutcome, spool: ScanSpool | None, slam_s: float) -> SlamResult:
-        own, config = self._folder, self._config
+        own, config, told = self._folder, self._config, list[str]()
         began = time.perf_counter()
         if self._has_imu:
             outcome, earth = lay_onto_earth(self._recording, own, outcome, config)
         else:
-            outcome, earth = outcome.upright(), None
+            maps = LocalMapFolder(own.local_maps)
+            level = next((number for number in range(len(outcome.correction.time_ns)) if maps[number].is_level), None)
+            outcome, earth = outcome if level is None else outcome.upright(level), None
+            told.append(_told_of_up(outcome, level))
             write_graph(own.graph, outcome)
-        correction, gnss, told = outcome.correction, None, [] if outcome.accepted else [LEFT_IN_PLACE]
-        if not self._has_imu:
-            told += _told_without_imu(outcome, self._recording.info.gnss_topic)
+            if self._recording.info.gnss_topic:
+                told.append("the positions by satellite are not used: that takes an IMU, which tells where down is")
+        correction, gnss = outcome.correction, None
+        if not outcome.accepted:
+            told.insert(0, LEFT_IN_PLACE)
         told += pairs_without_maps(*self._decided, len(correction.time_ns))
         doubt = odometry.contradiction or outcome.doubt
         write_corrected_trajectory(own, outcome.placed, is_closed=bool(outcome.accepted))
@@ -256,15 +261,16 @@ def _checked_to_go_on(folder: SlamFolder, config: str) -> int:
     return 1 + (read_slam_summary(folder.summary).resumed if folder.summary.is_file() else 0)
 
 
-def _told_without_imu(outcome: SlamOutcome, gnss_topic: str) -> list[str]:
+def _told_of_up(outcome: SlamOutcome, level: int | None) -> str:
+    """Without an IMU; `level` is the first local map that shows it."""
+    if level is None:
+        return "no IMU tells where down is, and nothing shows where up is: the map stands as the LiDAR did"
+    maps = "the first local map do" if level == 0 else f"local map {level} do, those of earlier ones do not"
     tilt = np.degrees(2.0 * np.arccos(np.clip(outcome.T_world_map[0], -1.0, 1.0)))
-    told = [
-        "no IMU tells where down is: surfaces of the first local map do; trajectory and map are turned upright, by "
-        f"{tilt:.1f}° from where the LiDAR began"
-    ]
-    if gnss_topic:
-        told.append("the positions by satellite are not used: that takes an IMU, which tells where down is")
-    return told
+    return (
+        f"no IMU tells where down is: surfaces of {maps}; trajectory and map are turned upright, by {tilt:.1f}° from where the "
+        "LiDAR began"
+    )
 
 
 def _waiting(search: LoopSearch) -> Progress:

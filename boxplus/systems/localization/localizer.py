@@ -142,8 +142,8 @@ class Localizer:
             time_ns: absolute [ns], later than the one before.
             T_odo_body: (7,) pose of the body in the odometry's world.
             p_body: (N, 3) its points in the body's frame [m].
-            up_odo: (3,) against gravity, in the odometry's world. None where nobody knows: while it is searched, surfaces tell,
-                within 45° of the body's z axis; then the map does.
+            up_odo: (3,) against gravity, in the odometry's world. None where nobody knows: while it is searched, surfaces of
+                each query tell, within 45° of the body's z axis; then the map does.
             lost: the odometry does not know where this scan belongs.
 
         Raises:
@@ -345,7 +345,8 @@ class Localizer:
                 least_length=0.0,
                 voxel=self._map.voxel,
                 max_range=_QUERY_RANGE,
-            )  # type: ignore[call-arg]
+            ),  # type: ignore[call-arg]
+            looks_anew=True,  # an odometry of a LiDAR alone drifts while it is searched
         )
 
 

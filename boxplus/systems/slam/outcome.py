@@ -41,12 +41,15 @@ class SlamOutcome:
         """The correction to the frame of trajectory and map."""
         return replace(self.correction, T_map=se3.compose(self.T_world_map, self.correction.T_map))
 
-    def upright(self) -> SlamOutcome:
-        """The same with trajectory and map turned about their origin, the shortest way, until the first local map is level.
+    def upright(self, number: int) -> SlamOutcome:
+        """The same with trajectory and map turned about their origin, the shortest way, until one of the local maps is level.
 
         For an odometry without an IMU, whose world stands as its LiDAR did.
+
+        Args:
+            number: of a map whose z axis is up.
         """
-        x, y, z = quaternion.to_matrix(self.correction.T_map[0, :4])[:, 2]
+        x, y, z = quaternion.to_matrix(self.correction.T_map[number, :4])[:, 2]
         half = np.sqrt(np.clip([0.5 * (1.0 + z), 0.5 * (1.0 - z)], 0.0, 1.0))  # cosine and sine of half the angle to (0, 0, 1)
         level = np.hypot(x, y)
         axis = np.array([y, -x]) / level if level > 0.0 else np.array([1.0, 0.0])

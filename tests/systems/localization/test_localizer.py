@@ -55,14 +55,18 @@ def test_a_start_elsewhere_is_found_and_followed(world: World, place_map: KnownM
     assert localizer.losses == 1 and localizer.doubt is None  # nothing speaks against where it was until then
 
 
-def test_a_lidar_alone_that_leans_is_found_and_followed(world: World, place_map: KnownMap) -> None:
-    """Nobody says where up is: surfaces do while it is looked for, then the map."""
-    drive = drive_of(world, [[14, 1.5], [0, 1.5]], seed=5)
+@pytest.mark.parametrize("is_blind", [False, True])
+def test_a_lidar_alone_that_leans_is_found_and_followed(world: World, place_map: KnownMap, is_blind: bool) -> None:
+    """Nobody says where up is: surfaces of every query do (the first may show none) while it is looked for, then the map."""
+    drive = drive_of(world, [[14, 1.5], [-8, 1.5]], seed=5)
     T_body_lidar = se3.exp([np.radians(15.0), np.radians(-10.0), 0.0, 0.0, 0.0, 0.0])
     back = se3.inverse(T_body_lidar)
     scans = [se3.act(back, scan.astype(np.float64)).astype(np.float32) for scan in drive.scans]
     leaning = replace(drive, scans=scans, T_world_body=se3.compose(drive.T_world_body, T_body_lidar))
-    found = push_all(Localizer(place_map, FEW), leaning, se3.compose(back, se3.compose(own_world(drive), T_body_lidar)), 0, None)
+    T_odo, localizer, found = se3.compose(back, se3.compose(own_world(drive), T_body_lidar)), Localizer(place_map, FEW), []
+    for time_ns, T, scan in zip(drive.time_ns.tolist(), T_odo, scans, strict=True):
+        is_lost = is_blind and localizer.last_search is None
+        found.append(localizer.push(time_ns, T, scan, None, lost=is_lost))
     xi = errors(found, leaning)
     assert found[-1].status == "localised" and len(xi) > 5
     assert np.linalg.norm(xi[:, 3:], axis=1).max() < 0.1 and np.linalg.norm(xi[:, :3], axis=1).max() < np.deg2rad(1.0)
