@@ -139,7 +139,7 @@ def test_a_loop_search_that_fails_or_dies_says_so(tmp_path: Path) -> None:
     maps.write(small_map(0))
     config = SlamConfig(appearance="none")
     with (
-        pytest.raises(InputError, match=r"expected a local map \(version 1 .*000001.npz"),
+        pytest.raises(InputError, match=r"expected a local map \(version 2 .*000001.npz"),
         LoopSearch(config, [], [], maps.path, tmp_path / "graph.npz") as search,
     ):
         search.give(0)
