@@ -12,6 +12,7 @@ from boxplus._chi_square import chi_square_quantile
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.manifolds.se3 import SE3
+from boxplus.manifolds.upright_rotation import upright_rotation
 from boxplus.optimization.losses import Squared
 from boxplus.optimization.outliers.graduated import graduate
 from boxplus.optimization.problem import Problem
@@ -87,11 +88,7 @@ class Fit:
 
 def level(T_odo: Floats) -> Floats:
     """(3, 3) rotation that turns the vertical of an odometry's world upright, without yaw."""
-    up = mean_up(T_odo)
-    axis = np.array([up[1], -up[0], 0.0])
-    sine = float(np.linalg.norm(axis))
-    turn = axis * (math.atan2(sine, float(up[2])) / sine) if sine > 0.0 else axis
-    return so3.exp(turn)
+    return upright_rotation(mean_up(T_odo))
 
 
 def fit(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from boxplus.manifolds import quaternion, se3
+from boxplus.manifolds.upright_rotation import upright_rotation
 from boxplus.systems.slam.correction import Correction
 from boxplus.systems.slam.graph import MapGraph
 from boxplus.systems.slam.loop import Floats, Loop
@@ -49,11 +50,8 @@ class SlamOutcome:
         Args:
             number: of a map whose z axis is up.
         """
-        x, y, z = quaternion.to_matrix(self.correction.T_map[number, :4])[:, 2]
-        half = np.sqrt(np.clip([0.5 * (1.0 + z), 0.5 * (1.0 - z)], 0.0, 1.0))  # cosine and sine of half the angle to (0, 0, 1)
-        level = np.hypot(x, y)
-        axis = np.array([y, -x]) / level if level > 0.0 else np.array([1.0, 0.0])
-        return replace(self, T_world_map=np.array([half[0], *(half[1] * axis), 0.0, 0.0, 0.0, 0.0]))
+        up = quaternion.to_matrix(self.correction.T_map[number, :4])[:, 2]
+        return replace(self, T_world_map=np.concatenate([quaternion.from_matrix(upright_rotation(up)), np.zeros(3)]))
 
     def laid(self, T_map: Floats, T_enu_map: Floats) -> SlamOutcome:
         """The same with local maps (n, 7) where positions by satellite put them, and the map's frame in ENU (7,)."""

@@ -20,6 +20,7 @@ from boxplus.filtering.nav_state import (
     NavState,
 )
 from boxplus.manifolds import so3
+from boxplus.manifolds.upright_rotation import upright_rotation
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
@@ -47,16 +48,6 @@ _ANY_GYRO_BIAS_STD = 0.05  # rad/s, of a gyroscope in order, about axes where th
 _TWICE = 4.0  # the batch and then the filter see the same scans: its covariance is widened by this
 
 
-def _gravity_rotation(up_imu: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shortest rotation that takes the measured `up_imu` (3,) to +z (docs/lidar_inertial_odometry.md, section 10)."""
-    up = up_imu / np.linalg.norm(up_imu)
-    if up[2] < -1.0 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
-    K = so3.hat(np.array([up[1], -up[0], 0.0]))
-    rotation: NDArray[np.float64] = np.eye(3) + K + K @ K / (1.0 + up[2])
-    return rotation
-
-
 def _first_covariance(
     config: LioConfig, *, gyro_sigma: float, accel_sigma: float, velocity_sigma: float, gravity_sigma: float
 ) -> NDArray[np.float64]:
@@ -77,7 +68,7 @@ def _first_covariance(
 def static_state(imu: ImuSamples, extrinsic: NavState, config: LioConfig) -> tuple[NavState, NDArray[np.float64]]:
     """State and (24, 24) covariance of a platform at rest: gravity and biases are what the IMU shows on average."""
     up = imu.accel.mean(axis=0)
-    R = _gravity_rotation(up) if config.gravity_aligned else np.eye(3)
+    R = upright_rotation(up) if config.gravity_aligned else np.eye(3)
     direction = R @ up / np.linalg.norm(up)
     # The part of the bias along gravity is seen at once: whatever the norm exceeds 9.81 m/s² by.
     bias_accel = up * (1.0 - STANDARD_GRAVITY / np.linalg.norm(up))
@@ -159,7 +150,7 @@ def moving_state(
     v_path = first.state[3:] + known.change[:3] + (0.5 * (force[1:] + force[:-1]) * dt).sum(axis=0) + gravity * float(dt.sum())
     gravity *= STANDARD_GRAVITY / float(np.linalg.norm(gravity))
     R_path_imu = R_grid[-1]
-    R_world_path = _gravity_rotation(-gravity) if config.gravity_aligned else R_path_imu.T
+    R_world_path = upright_rotation(-gravity) if config.gravity_aligned else R_path_imu.T
     state = NavState(
         R_world_path @ R_path_imu,
         np.zeros(3),
