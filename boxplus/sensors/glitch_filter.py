@@ -7,9 +7,9 @@ from collections import Counter
 import numpy as np
 
 from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import EMPTY, GLITCH, empty, glitches
+from boxplus.sensors.imu_values import BEFORE, EMPTY, GLITCH, empty, glitches
 
-_CONTEXT = 22  # samples before one that tell what is usual
+_CONTEXT = BEFORE + 2  # samples: the ends of the steps that tell what is usual, and the one that may wait
 
 
 class GlitchFilter:

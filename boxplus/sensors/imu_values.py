@@ -15,7 +15,7 @@ GYRO_LIMIT, ACCEL_LIMIT = 100.0, 400.0  # rad/s, m/s²: more than any IMU on a r
 # Per second, and at least: no platform turns or is pushed so much from one sample to the next, and back to the one after.
 _GLITCH_GYRO, _GLITCH_ACCEL = (1000.0, 3.0), (20_000.0, 100.0)  # rad/s² and rad/s, m/s³ and m/s²
 _USUAL = 10.0  # times what the samples before differ by: a shaken IMU differs from sample to sample
-_BEFORE, _FEWEST = 20, 8  # steps before a sample that tell what is usual
+BEFORE, _FEWEST = 20, 8  # steps before a sample that tell what is usual: so many at most, at least
 
 
 def finite(imu: ImuSamples) -> NDArray[np.bool_]:
@@ -35,6 +35,8 @@ def empty(imu: ImuSamples) -> NDArray[np.bool_]:
 
 def measurements(imu: ImuSamples, rejected: Counter[str]) -> ImuSamples:
     """Samples that are numbers within what sensors measure; the others are counted by reason."""
+    if np.abs(imu.gyro).max(initial=0.0) <= GYRO_LIMIT and np.abs(imu.accel).max(initial=0.0) <= ACCEL_LIMIT:
+        return imu  # the usual case; NaN compares false
     numbers, too_large = finite(imu), beyond(imu)
     for reason, mask in ((NOT_FINITE, ~numbers), (BEYOND, too_large & numbers)):
         if mask.any():
@@ -57,7 +59,7 @@ def glitches(imu: ImuSamples) -> NDArray[np.bool_]:
         steps = np.linalg.norm(np.diff(values, axis=0), axis=1)
         far = steps > np.maximum(least, rate * seconds)
         for k in np.flatnonzero(far):  # the step into sample k + 1; nearly always there is none
-            before = steps[max(k - _BEFORE, 0) : k]
+            before = steps[max(k - BEFORE, 0) : k]
             if mask[k] or len(before) < _FEWEST or not steps[k] > _USUAL * float(np.median(before)):
                 continue
             if k + 2 == len(imu):

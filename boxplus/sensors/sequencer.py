@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from boxplus.sensors.checked import checked_imu, checked_scan
 from boxplus.sensors.glitch_filter import GlitchFilter
 from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import ACCEL_LIMIT, GYRO_LIMIT, measurements
+from boxplus.sensors.imu_values import measurements
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.time_steps import TimeSteps
 
@@ -97,10 +97,10 @@ class Sequencer:
         Raises:
             InputError: as `checked_imu`.
         """
-        samples = checked_imu(samples)
+        samples = measurements(checked_imu(samples), self.rejected)
         if not len(samples):
             return
-        if self._in_order(samples):
+        if self._in_order(samples.time_ns):
             self._imu_jumps = 0
             self._imu_steps.went_on()
             self._last_imu_ns = int(samples.time_ns[-1])
@@ -109,16 +109,13 @@ class Sequencer:
         else:
             self._add_one_by_one(samples)
 
-    def _in_order(self, samples: ImuSamples) -> bool:
-        """Whether nothing is wrong with any sample: the usual case, which costs no loop. NaN compares false."""
-        last, time = self._last_imu_ns, samples.time_ns
-        if not (np.abs(samples.gyro).max() <= GYRO_LIMIT and np.abs(samples.accel).max() <= ACCEL_LIMIT):
-            return False
-        steps = np.diff(time if last is None else np.concatenate([[last], time]))
+    def _in_order(self, time_ns: NDArray[np.int64]) -> bool:
+        """Whether nothing is wrong with any time: the usual case, which costs no loop."""
+        last = self._last_imu_ns
+        steps = np.diff(time_ns if last is None else np.concatenate([[last], time_ns]))
         return not len(steps) or bool(steps.min() > 0 and steps.max() <= self._max_jump_ns)
 
     def _add_one_by_one(self, samples: ImuSamples) -> None:
-        samples = measurements(samples, self.rejected)
         time = samples.time_ns
         keep = np.zeros(len(samples), dtype=bool)
         for i in range(len(samples)):

@@ -105,8 +105,7 @@ def drop_imu(start_s: float = 10.0, duration_s: float = 1.0) -> Fault:
     """No IMU samples for a while."""
 
     def imu(samples: ImuSamples, inside: _Inside) -> ImuSamples:
-        keep = ~inside(samples.time_ns)
-        return ImuSamples(samples.time_ns[keep], samples.gyro[keep], samples.accel[keep])
+        return samples.where(~inside(samples.time_ns))
 
     return Fault("drop_imu", f"no IMU samples for {duration_s:g} s", _Change(imu=imu, start_s=start_s, duration_s=duration_s))
 

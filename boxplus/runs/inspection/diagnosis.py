@@ -24,7 +24,7 @@ from boxplus.recordings.stream_checks import StreamLog, check_cover, check_point
 from boxplus.runs.inspection.agreement_checks import Compared, check_agreement
 from boxplus.runs.inspection.cameras.examination import examine_cameras
 from boxplus.runs.inspection.gnss_checks import check_gnss, check_receivers
-from boxplus.runs.inspection.imu_checks import check_finite, check_rest, check_saturation, first_second, quiet_stretch
+from boxplus.runs.inspection.imu_checks import check_rest, check_saturation, check_values, first_second, quiet_stretch
 from boxplus.runs.inspection.lidar_checks import examine_other_lidars
 from boxplus.runs.inspection.stretches import Stretch, gather_scans, lively_stretches
 from boxplus.sensors.imu import ImuSamples
@@ -209,7 +209,7 @@ def _examine(
         return
     found += check_rate("imu", imu.time_ns, gap_factor=3.0, slow_hz=_SLOW_IMU_HZ)
     found.append(check_cover(log, imu))
-    found += check_finite(imu)
+    found += check_values(imu)
     clean = usable(imu)
     if len(clean) < 10:
         found.append(

@@ -137,7 +137,7 @@ def check_saturation(imu: ImuSamples) -> Evidence:
     )
 
 
-def check_finite(imu: ImuSamples) -> list[Evidence]:
+def check_values(imu: ImuSamples) -> list[Evidence]:
     """IMU samples that no sensor in order delivers."""
     numbers, too_large, zero = finite(imu), beyond(imu), empty(imu)
     rest = imu.where(numbers & ~too_large & ~zero)

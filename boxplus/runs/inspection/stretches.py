@@ -30,7 +30,7 @@ class Stretch:
     def between(cls, imu: ImuSamples, begin_ns: int, end_ns: int) -> Stretch:
         """Without scans, with the samples around it."""
         inside = (imu.time_ns >= begin_ns - _MARGIN_NS) & (imu.time_ns <= end_ns + _MARGIN_NS)
-        return cls(begin_ns, end_ns, ImuSamples(imu.time_ns[inside], imu.gyro[inside], imu.accel[inside]))
+        return cls(begin_ns, end_ns, imu.where(inside))
 
 
 def lively_stretches(imu: ImuSamples, seconds: float, most: int) -> list[Stretch]:

@@ -26,7 +26,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surface
 _DETERMINED_M_S = 0.15  # standard deviation of the speed along an axis
 _SLOW_M_S, _SLOW_RAD_S = 0.03, 0.01
 _NEAR_M = 0.03
-_SWING_RAD = 0.06
+_SWING_RAD = 0.06  # a turn to and fro that is none of registrations' noise
 _DEVIATIONS = 3.0
 _POSE_SIGMA_M = 0.004
 _CREEP_M_S, _CREEP_RAD_S = 0.15, 0.25
@@ -87,7 +87,7 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
     creeps = speed < _CREEP_M_S and rate < _CREEP_RAD_S
     # What swings to and fro may end as it began.
     swings = (np.abs(p @ along) > 2.0 * near).any() or np.linalg.norm(turned @ shown, axis=1).max() > _SWING_RAD
-    at_rest = bool((slow and rate < _SLOW_RAD_S and not swings) or (creeps and not swings and _fits_unmoved(path, scans, config)))
+    at_rest = bool(not swings and ((slow and rate < _SLOW_RAD_S) or (creeps and _fits_unmoved(path, scans, config))))
     open_axes = axes[:, ~seen].T
     if at_rest and seen.all() and not faces(path, scans, config, axes[:, 0]):
         open_axes = axes[:, :1].T

@@ -170,8 +170,7 @@ class VisualInertialOdometry:
     @property
     def counters(self) -> Mapping[str, int]:
         """What could not be used before it reached the window, by reason."""
-        counts = self._counters + self._glitches.rejected
-        return Counter({reason: count for reason, count in counts.items() if count})
+        return self._counters + self._glitches.rejected
 
     @property
     def start_problem(self) -> str | None:
@@ -292,7 +291,7 @@ class VisualInertialOdometry:
         """Samples from before the oldest frame that is still needed are not; some are kept for an offset of the clocks."""
         oldest = int(np.searchsorted(self._imu.time_ns, oldest_ns + self.window.cut_ns - 2 * SPARE_NS)) - 2
         if oldest > 0:
-            self._imu = ImuSamples(self._imu.time_ns[oldest:], self._imu.gyro[oldest:], self._imu.accel[oldest:])
+            self._imu = self._imu.where(slice(oldest, None))
 
     def _before_start(self, time_ns: int, images: dict[int, NDArray[Any]]) -> VioEstimate:
         turn = np.eye(3)

@@ -13,7 +13,7 @@ from boxplus.recordings.stream_checks import check_rate, check_rejected
 from boxplus.runs.inspection.cameras.comparison import Comparison
 from boxplus.runs.inspection.cameras.stereo import check_synchronisation
 from boxplus.runs.inspection.cameras.views import GAP_FACTOR, Views, check_blur, check_corners, check_views
-from boxplus.runs.inspection.imu_checks import check_finite, check_saturation
+from boxplus.runs.inspection.imu_checks import check_saturation, check_values
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.imu import ImuSamples
 
@@ -56,7 +56,7 @@ def examine_cameras(recording: CameraRecording, report: Callable[[float], None])
     if imu:
         samples = ImuSamples.joined(imu)
         found += check_rate("imu", samples.time_ns, gap_factor=3.0, slow_hz=_SLOW_IMU_HZ)
-        found += check_finite(samples)
+        found += check_values(samples)
         found.append(check_saturation(samples))
         found += compared.with_imu(samples)
     return found

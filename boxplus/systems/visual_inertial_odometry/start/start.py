@@ -123,7 +123,7 @@ def find_rest(seen: Sequence[Tracks], imu: ImuSamples, rig: Rig, config: VioConf
         within = (imu.time_ns >= time_ns[first]) & (imu.time_ns <= time_ns[-1])
         if np.count_nonzero(within) < _FEWEST_SAMPLES:
             return f"{np.count_nonzero(within)} IMU samples in {duration:.2f} s ({_FEWEST_SAMPLES} are needed)"
-        samples = ImuSamples(imu.time_ns[within], imu.gyro[within], imu.accel[within])
+        samples = imu.where(within)
         rest = judge_rest(seen[first:], samples, noise, config.gravity, config.accel_bias_sigma)
         if not rest.problem:
             break
