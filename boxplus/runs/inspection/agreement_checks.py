@@ -33,6 +33,7 @@ _KEYS: dict[Cause, tuple[str, str]] = {
     "clock_drift": ("clock_drift", "drifting"),
     "force_sign": ("gravity_sign", "inverted"),
     "length_scale": ("length_scale", "wrong"),
+    "corrected_points": ("point_times", "points corrected before"),
 }
 """Key and value of the evidence that a contradiction becomes."""
 
@@ -85,7 +86,9 @@ def check_agreement(
         ("gravity_sign", lambda: _force_sign(compared)),
         ("length_scale", lambda: _lengths(compared)),
     ]
-    if not {"gyro_scale", "same_platform", "points_mirrored"} & set(found):  # with these nothing else can be judged
+    if not {"gyro_scale", "same_platform", "points_mirrored", "point_times"} & set(
+        found
+    ):  # with these nothing else can be judged
         for key, check in checks:
             if key not in found:
                 found[key] = check()

@@ -25,6 +25,7 @@ from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.imu_values import beyond, empty, finite, glitches
 from boxplus.sensors.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.corrected_points import CorrectedPoints, corrected_points
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import surer_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
@@ -69,6 +70,7 @@ class Agreement:
         planes: how upright the surroundings are under the declared mounting; None where none was declared, or nothing shows it.
         in_feet: the accelerations again with the points taken for feet; None where they are not as thick as feet would be.
         astray: that the motion an estimator expected is not the one its scans show; None where it is, or none was given.
+        corrected: that the points were corrected for motion before they were recorded; None where nothing shows it.
     """
 
     path: LidarPath
@@ -80,6 +82,7 @@ class Agreement:
     planes: PlaneTilt | None = None
     in_feet: TranslationFit | None = None
     astray: Finding | None = None
+    corrected: CorrectedPoints | None = None
 
 
 def compare_sensors(
@@ -159,7 +162,8 @@ def _compare(
         if again.rotation is not None and again.rotation.explained > _EXPLAINED:
             found = again
     planes = None if T_declared is None else plane_tilt(found.path, scans, imu, T_declared[:3, :3], config)
-    return replace(found, planes=planes, astray=astray)
+    before = corrected_points(found.path, found.rotation, scans, imu, config, guesses)
+    return replace(found, planes=planes, astray=astray, corrected=before)
 
 
 def _as_thick_as_feet(found: Agreement) -> bool:

@@ -17,6 +17,7 @@ Cause = Literal[
     "force_sign",
     "length_scale",
     "astray",
+    "corrected_points",
 ]
 
 

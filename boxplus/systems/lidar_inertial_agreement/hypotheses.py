@@ -69,6 +69,7 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
         or _of_sign(rotation)
         or _of_belonging(agreement, rotation)
         or _of_mirror(rotation, translation, T_declared)
+        or (None if agreement.corrected is None else agreement.corrected.finding)
     )
     if found is not None:
         return [found]  # what follows from it is not worth a sentence of its own
@@ -127,7 +128,7 @@ def judges(cause: Cause, agreement: Agreement) -> bool:
     rotation = agreement.rotation
     if rotation is None:
         return False
-    if cause in ("time_offset", "clock_drift"):
+    if cause in ("time_offset", "clock_drift", "corrected_points"):
         return _path_counts(agreement) and judges_clocks(rotation)
     if cause in ("force_sign", "length_scale"):
         return judges_lengths(agreement)

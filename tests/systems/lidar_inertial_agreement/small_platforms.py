@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -11,6 +13,7 @@ from boxplus.manifolds import so3
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar
+from boxplus.simulation.faults import Event
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.scenarios import mounting
 from boxplus.simulation.worlds import worlds
@@ -40,6 +43,21 @@ def data(simulation: Simulation, fault: Fault | None = None) -> Data:
     blocks = [event for event in events if isinstance(event, ImuSamples)]
     joined = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("time_ns", "gyro", "accel"))
     return [event for event in events if isinstance(event, Scan)], ImuSamples(*joined)
+
+
+def corrected(simulation: Simulation, end: bool) -> Fault:
+    """Points as the LiDAR would have seen them at the end of their scan, or its beginning, with the times they had."""
+
+    def events(incoming: Iterable[Event]) -> Iterator[Event]:
+        for event in incoming:
+            if isinstance(event, Scan):
+                time_ns = np.append(event.time_ns, event.end_ns if end else event.start_ns)
+                R, p = true_poses(simulation, np.clip(time_ns, simulation.start_ns, simulation.end_ns))
+                p_world = np.einsum("nij,nj->ni", R[:-1], event.p_lidar) + p[:-1]
+                event = replace(event, p_lidar=((p_world - p[-1]) @ R[-1]).astype(np.float32))
+            yield event
+
+    return Fault("corrected", f"points corrected to the {'end' if end else 'beginning'} of their scan", events)
 
 
 def true_poses(simulation: Simulation, time_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
