@@ -47,11 +47,11 @@ from boxplus.systems.bundle_adjustment.reconstruction_problem import (
     pixel_errors,
     refuse_focal_lengths,
     start_values,
+    turned_lenses,
 )
 from boxplus.systems.bundle_adjustment.strays import stray_notes, stray_points
 
 _ROUNDS = 3  # of looking for points that have a lower minimum elsewhere
-_FOCAL = 7  # column of a camera of BAL as a variable: rotation, translation, f, k1, k2
 _MOST = 0.5  # share of the observations that a robust loss may silence
 _BAD_SHARE = 0.005  # of observations behind their cameras or left out for it, above which a result is not to be trusted
 
@@ -151,7 +151,7 @@ def adjust_bundle(
     camera_of, point_of = (
         np.concatenate([group.connections[slot].rows for group in problem.groups]).astype(np.int64) for slot in (0, 1)
     )
-    _refuse_turned_lenses(reconstruction, solution.values[cameras.number])
+    _refuse_turned_lenses(reconstruction, config, problem, solution, cameras, other_axes)
     watch = Watch(callback)
     strayed: list[NDArray[np.int64]] = []
     are_late = False  # the last ones, for which no steps are left
@@ -172,7 +172,7 @@ def adjust_bundle(
         again = _continued(problem, solution, config, values, left, callback)
         if not again.cost < solution.cost:
             break
-        _refuse_turned_lenses(reconstruction, again.values[cameras.number])
+        _refuse_turned_lenses(reconstruction, config, problem, again, cameras, other_axes)
         solution, are_late = again, left <= 0
         strayed.append(numbers)
     cheirality = count_behind(sound, adjusted)
@@ -189,12 +189,17 @@ def adjust_bundle(
     notes += [*gross, *sigma_notes(errors, config.sigma_px, left, is_given=is_given)]
     notes += misfit_notes(solution.cost, left, config.sigma_px, loss, is_given=is_given)
     seen = np.unique(point_of)
-    lens = lens_finding(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution, left, watch)
-    if lens is not None and not lens.is_grave:
-        notes.append(lens.sentence)
     origin = pixel_origin(reconstruction, config, loss, errors, solution, left, watch)
     if origin.note is not None:
         notes.append(origin.note)
+    is_explained = origin.note is not None or origin.doubt is not None
+    lens = (
+        None
+        if is_explained
+        else lens_finding(adjusted, sound.used, sound.cheirality.dropped, config, loss, solution, left, watch)
+    )
+    if lens is not None and not lens.is_grave:
+        notes.append(lens.sentence)
     unconverged, late = unconverged_findings(solution, points, depth.undetermined, ids)
     notes += late
     said = [
@@ -224,20 +229,35 @@ def adjust_bundle(
     )
 
 
-def _refuse_turned_lenses(reconstruction: Reconstruction, cameras: NDArray[np.float64]) -> None:
-    """BAL's focal lengths are variables, and nothing but the images keeps them positive."""
-    if not isinstance(reconstruction, BalProblem):
-        return
-    bad = np.flatnonzero(~(cameras[:, _FOCAL] > 0.0))
+def _refuse_turned_lenses(
+    reconstruction: Reconstruction,
+    config: BundleAdjustmentConfig,
+    problem: Problem,
+    solution: Solution,
+    cameras: Variables,
+    other_axes: str | None,
+) -> None:
+    """Focal lengths that are variables nothing but the images keeps positive.
+
+    Args:
+        other_axes: what the start says of the axes of the pixels.
+    """
+    bad, lenses = turned_lenses(reconstruction, config, problem, solution, cameras)
     if not len(bad):
         return
-    few = 2 * len(bad) < len(cameras)
+    name, focal_length = bad[0]
+    if other_axes is not None:
+        advice = other_axes
+    elif 2 * len(bad) < lenses:
+        advice = "too few observations or wrong matches there: leave such cameras out, or use a robust loss"
+    elif isinstance(reconstruction, BalProblem):
+        advice = "are the pixels turned by half a turn (BAL counts x to the right and y upwards), or is the start wrong?"
+    else:
+        advice = "are axes of the pixels flipped or swapped, or is the start wrong? Held intrinsics show more"
     raise InputError(
         "images that keep the focal lengths positive",
-        f"{len(bad)} of {len(cameras)} that came out negative, that of camera {bad[0]} as {cameras[bad[0], _FOCAL]:.4g} px",
-        "too few observations or wrong matches there: leave such cameras out, or use a robust loss"
-        if few
-        else "are the pixels turned by half a turn (BAL counts x to the right and y upwards), or is the start wrong?",
+        f"{len(bad)} of {lenses} that came out negative, that of camera {name} as {focal_length:.4g} px",
+        advice,
     )
 
 

@@ -27,6 +27,8 @@ from boxplus.systems.bundle_adjustment.sightings import COLMAP_LAYOUT, colmap_la
 
 Mask = NDArray[np.bool_]
 
+_FOCAL = 7  # column of a camera of BAL as a variable: rotation, translation, f, k1, k2
+
 
 def add_reconstruction(
     problem: Problem, reconstruction: Reconstruction, used: Mask, config: BundleAdjustmentConfig, loss: Loss | None
@@ -107,7 +109,7 @@ def _add_colmap(
             held = Reprojection(camera, model.pixels[chosen], sigma=config.sigma_px)
             problem.add_residuals(held, *connections, loss=loss, name=label)
             continue
-        free, offset, basis = _free_parameters(model, number, config)
+        free, offset, basis = free_parameters(model, number, config)
         refined = ReprojectionTiedIntrinsics(camera, model.pixels[chosen], offset, basis, sigma=config.sigma_px)
         start = model.camera_params[number][free]
         intrinsics = problem.add_variables(refined.manifolds[2], start, name=_intrinsics_name(name))
@@ -119,7 +121,7 @@ def _intrinsics_name(camera_id: int) -> str:
     return f"intrinsics of camera {camera_id}"
 
 
-def _free_parameters(
+def free_parameters(
     model: ColmapModel, number: int, config: BundleAdjustmentConfig
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
     """Which of COLMAP's parameters are refined, and offset and basis of `ReprojectionTiedIntrinsics` for them."""
@@ -128,6 +130,25 @@ def _free_parameters(
     if config.principal_point == "held":
         free[list(COLMAP_LAYOUT[model.camera_models[number]][2:4])] = False
     return free, layout[:, ~free] @ model.camera_params[number][~free], layout[:, free]
+
+
+def turned_lenses(
+    reconstruction: Reconstruction, config: BundleAdjustmentConfig, problem: Problem, solution: Solution, cameras: Variables
+) -> tuple[list[tuple[int, float]], int]:
+    """Names and focal lengths [px] of cameras of which it came out negative, and of how many it was refined."""
+    if isinstance(reconstruction, BalProblem):
+        lengths = dict(enumerate(solution[cameras][:, _FOCAL]))
+    elif isinstance(reconstruction, ColmapModel) and config.intrinsics == "refined":
+        names = {_intrinsics_name(name): (name, number) for number, name in enumerate(reconstruction.camera_ids)}
+        lengths = {}
+        for block in problem.blocks:
+            if block.name in names:
+                name, number = names[block.name]
+                _, offset, basis = free_parameters(reconstruction, number, config)
+                lengths[int(name)] = float((offset + basis @ solution[block][0])[:2].min())
+    else:
+        lengths = {}
+    return [(name, float(f)) for name, f in lengths.items() if not f > 0.0], len(lengths)
 
 
 def mean_error_of_points(count: int, errors: NDArray[np.float64], point_of: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -160,7 +181,7 @@ def adjusted_reconstruction(
     for block in problem.blocks:
         if block.name in names:
             number = names[block.name]
-            params[number][_free_parameters(reconstruction, number, config)[0]] = solution[block][0]
+            params[number][free_parameters(reconstruction, number, config)[0]] = solution[block][0]
     mean = mean_error_of_points(len(p_world), errors, point_of)
     known = np.where(np.isfinite(mean), mean, -1.0)
     return replace(reconstruction, T_camera_world=T, points=p_world, camera_params=tuple(params), errors=known)

@@ -268,6 +268,15 @@ def test_focal_lengths_of_bal_that_turn_negative_are_named():
         adjust_bundle(replace(start, pixels=-start.pixels))
 
 
+def test_refined_focal_lengths_of_colmap_that_turn_negative_are_named_with_the_axes_that_the_start_tells():
+    refined = BundleAdjustmentConfig(intrinsics="refined")
+    start = reconstruction(73, "colmap")
+    with pytest.raises(InputError, match=r"1 of 1 that came out negative, that of camera 3.*flipped or swapped"):
+        adjust_bundle(replace(start, pixels=-start.pixels), refined)
+    with pytest.raises(InputError, match=r"that of camera 3.*is y of the pixels flipped"):
+        adjust_bundle(replace(start, pixels=start.pixels * [1.0, -1.0]), refined)
+
+
 @pytest.mark.parametrize("wrong", [0.8, 1.15])
 def test_a_wrong_focal_length_that_is_held_is_told(wrong):
     start = reconstruction(68, "colmap")

@@ -1,5 +1,7 @@
 """Whether intrinsics that are held are those of the images: what freeing them would gain.
 
+All of them are held, or, where intrinsics are refined, the principal point and what the camera model does not have.
+
 A wrong lens bends a scene and its cameras by as much as it is wrong, and leaves errors that look like those of noise. Where the
 images tell it, they tell it at once: the cost falls by more than chance when the intrinsics may move. One step shows whether it
 does; only where it does others follow, to where it falls.
@@ -17,13 +19,12 @@ from boxplus.errors import BoxplusError
 from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.between_formats import colmap_of
 from boxplus.formats.reconstructions.colmap_model import ColmapModel
-from boxplus.formats.reconstructions.gbp import GbpProblem
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
 from boxplus.optimization.losses import Huber, Loss
 from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
-from boxplus.systems.bundle_adjustment.doubts.lens_advice import NAMES, PARTS, lens_advice
+from boxplus.systems.bundle_adjustment.doubts.lens_advice import NAMES, PARTS, free_already, lens_advice
 from boxplus.systems.bundle_adjustment.examination import Watch, examination_options
 from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconstruction, adjusted_reconstruction
 from boxplus.systems.bundle_adjustment.sightings import Sightings, colmap_layout, colmap_pinhole
@@ -34,6 +35,9 @@ _CHANGED = 0.01  # of the pixels' distance from the principal point, by which th
 _MORE_STEPS = 0.2  # of the cost, which no further steps gain after as many as were allowed
 _BENT, _FALLS = 0.03, 0.6  # the same, and what is left of the cost, for a scene that is bent by more than the noise of its points
 _ROUGH_PX, _OF_START, _STEPS = 2.0, 0.5, 10  # [px] median error of a start; share of it that another lens leaves; steps
+_HALF = (
+    1.0  # of what is left, by which the cost of a BAL file has to fall, within two steps; real lenses gain a quarter to a third
+)
 _RADIAL = frozenset({"k1", "k2"})
 _FEW = tuple(  # of all parts, asked whether they say as much as more of them
     frozenset(parts)
@@ -74,25 +78,29 @@ def lens_finding(
 ) -> LensFinding | None:
     """Whether another lens than the one that was held explains the images clearly better.
 
+    BAL's lenses are never held, but have no principal point and square pixels: where others halve the cost, that is told.
+
     Args:
         adjusted: where bundle adjustment ended, as `solved` tells; at a minimum, or after the steps that were allowed.
         used: (k,) observations that were adjusted. dropped: points that were not.
         left: measurements less unknowns.
     """
     cost = solved.cost
-    if isinstance(adjusted, BalProblem) or config.intrinsics != "held" or left <= 0 or not cost > 0.0:
+    if left <= 0 or not cost > 0.0 or not (solved.status == "converged" or solved.limit == "steps"):
         return None
     given = adjusted
+    free, count = free_already(adjusted, used, config)
     used, adjusted = _with_any_lens(adjusted, used)
-    if not (solved.status == "converged" or solved.limit == "steps"):
-        return None
-    ask = partial(_freed, adjusted, used, dropped, config, loss, solved, left, watch)
+    ask = partial(_freed, adjusted, used, dropped, config, loss, solved, left, count, watch)
+    if isinstance(given, BalProblem):
+        return _finding_of_bal(adjusted, ask(free | {"cx, cy"}, least=_HALF, looks=2, hint=1.0), cost)
     # Distortion alone first: few images tell it well, and focal lengths and principal point, beside which it gets lost, hardly.
-    found = min(filter(None, map(ask, (_RADIAL, frozenset(PARTS)))), key=lambda freed: freed.cost, default=None)
+    wanted = (free | _RADIAL, frozenset(PARTS))
+    found = min(filter(None, map(ask, wanted)), key=lambda freed: freed.cost, default=None)
     if found is None:
         return None
     for parts in _FEW:
-        fewer = ask(parts) if parts < found.parts else None
+        fewer = ask(parts) if free <= parts < found.parts else None
         if fewer is not None and fewer.cost <= found.cost * (
             1.0 + _by_chance(found.numbers - fewer.numbers, left - found.numbers)
         ):
@@ -110,9 +118,25 @@ def lens_finding(
     )
 
 
+def _finding_of_bal(adjusted: ColmapModel, found: _Freed | None, cost: float) -> LensFinding | None:
+    """The format has no principal point and square pixels: nothing to be done about it but in the pixels."""
+    if found is None or not _changes(adjusted, found.lenses)[1] > _CHANGED:
+        return None
+    old, new = (np.array(model.camera_params) for model in (adjusted, found.lenses))
+    x, y = np.median(new[:, 2:4] - old[:, 2:4], axis=0) * [1.0, -1.0]
+    stretch = float(np.median(new[:, 1] / new[:, 0]))
+    return LensFinding(
+        f"another lens than the format has explains the images better: with the principal point at ({x:.3g}, {y:.3g}) px and y "
+        f"stretched {stretch:.3g} times, in the median of the cameras, the cost falls from {cost:.6g} to {found.cost:.6g} and "
+        "below, and the scene is bent by that; BAL counts pixels from the principal point, x to the right and y upwards, and "
+        "they are square: correct the pixels",
+        True,
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class _Freed:
-    """Lenses that explain the images better than chance, and the cost with them: `parts` of them, which are `numbers`, moved."""
+    """Lenses that explain the images better than chance, and the cost with them: `parts` moved, by `numbers` more than before."""
 
     lenses: ColmapModel
     cost: float
@@ -138,10 +162,21 @@ def _freed(
     loss: Loss | None,
     solved: Solution,
     left: int,
+    count: int,
     watch: Watch,
     parts: frozenset[str],
+    *,
+    least: float = 0.0,
+    looks: int = 1,
+    hint: float = _HINT,
 ) -> _Freed | None:
-    """What comes of it where these parts of every lens may move; None where that is no better than chance, or was stopped."""
+    """What comes of it where these parts of every lens may move; None where that is no better than chance, or was stopped.
+
+    Args:
+        count: numbers of the lenses that moved already.
+        least: by how much the cost has to fall at least, as a share of what is left of it.
+        looks: steps that are taken before it is asked whether it does. hint: share of that fall that it has to show then.
+    """
     held = tuple(place for part, places in PARTS.items() if part not in parts for place in places)
     cost = solved.cost
     free = config.model_copy(update={"intrinsics": "refined", "principal_point": "refined"})
@@ -155,19 +190,22 @@ def _freed(
     options = examination_options(problem, len(cameras), solved, config, watch)
     if options is None:
         return None
-    numbers = sum(block.values.size - len(block) * len(held) for block in lenses)
-    if left <= numbers:
+    numbers = sum(block.values.size - len(block) * len(held) for block in lenses) - count
+    if not 0 < numbers < left:
         return None
     share = _by_chance(numbers, left - numbers)
     if solved.limit == "steps":  # more steps would lower the cost without another lens, too
         share = max(share, _MORE_STEPS)
+    share = max(share, least)
 
-    shown = watch.of("another lens?")
+    shown, taken = watch.of("another lens?"), 0
 
     def is_settled(step: Iteration) -> bool:
+        nonlocal taken
         if shown(step):
             return True
-        return step.number > 0 and step.accepted and not cost - step.cost > _HINT * share * step.cost
+        taken += step.number > 0 and step.accepted
+        return taken >= looks and step.accepted and not cost - step.cost > hint * share * step.cost
 
     try:
         solution = problem.solve(options, callback=is_settled)
@@ -233,9 +271,9 @@ def _median_error(seen: Sightings, rows: NDArray[np.intp]) -> float:
     return float(np.median(errors)) if len(errors) else np.nan
 
 
-def _with_any_lens(held: GbpProblem | ColmapModel, used: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ColmapModel]:
+def _with_any_lens(held: Reconstruction, used: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ColmapModel]:
     """The same with cameras that may have any distortion, whatever their models have, and `used` (k,) in its order."""
-    if isinstance(held, GbpProblem):
+    if not isinstance(held, ColmapModel):
         used, held = used[np.argsort(held.camera_of, kind="stable")], colmap_of(held)
     params = [colmap_layout(held, number) @ held.camera_params[number] for number in range(len(held.camera_ids))]
     wide = tuple(np.pad(known, (0, len(NAMES) - len(known))) for known in params)

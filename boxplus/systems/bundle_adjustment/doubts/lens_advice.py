@@ -8,8 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.formats.reconstructions.bal import BalProblem
 from boxplus.formats.reconstructions.colmap_model import ColmapModel
 from boxplus.formats.reconstructions.reconstruction import Reconstruction
+from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
+from boxplus.systems.bundle_adjustment.reconstruction_problem import free_parameters
 from boxplus.systems.bundle_adjustment.sightings import Sightings, colmap_layout, colmap_pinhole
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
@@ -23,6 +26,24 @@ _MODELS = {  # the poorest first
     "RADIAL": frozenset({"f", "k1", "k2"}),
     "OPENCV": frozenset({"f", "fx, fy", "k1", "k2", "p1, p2"}),
 }
+
+
+def free_already(given: Reconstruction, used: NDArray[np.bool_], config: BundleAdjustmentConfig) -> tuple[frozenset[str], int]:
+    """Names of `PARTS` that an adjustment moves, of some lens at least, and how many numbers of all lenses together.
+
+    Args:
+        used: (k,) observations that are adjusted.
+    """
+    if isinstance(given, BalProblem):
+        return _MODELS["RADIAL"], 3 * len(np.unique(given.camera_of[used]))
+    if not isinstance(given, ColmapModel) or config.intrinsics == "held":
+        return frozenset(), 0
+    seen = given.point_of >= 0
+    seen[seen] = used
+    lenses = np.unique(given.camera_of[given.image_of[seen]])
+    count = sum(int(np.count_nonzero(free_parameters(given, number, config)[0])) for number in lenses)
+    parts = {part for number in lenses for part in _MODELS[given.camera_models[number]]} & set(PARTS)
+    return frozenset(parts | ({"cx, cy"} if config.principal_point == "refined" else set())), count
 
 
 def lens_advice(given: Reconstruction, parts: Set[str], before: ColmapModel, after: ColmapModel) -> str:

@@ -179,3 +179,41 @@ def test_of_several_camera_models_only_those_that_lack_something_are_to_be_repla
     )
     start = of("OPENCV", "RADIAL")
     assert lens_advice(start, {"k1", "cx, cy"}, start, start) == "--refine-intrinsics --refine-principal-point"
+
+
+@pytest.mark.parametrize("seed", [61, 65, 69])
+def test_a_principal_point_that_is_held_beside_refined_intrinsics_is_told(seed):
+    refined = BundleAdjustmentConfig(intrinsics="refined")
+    start = reconstruction(seed, "colmap")
+    told = adjust_bundle(replace(start, pixels=start.pixels + np.array([50.0, 30.0])), refined).doubt
+    assert "other intrinsics than those held" in told and "--refine-principal-point" in told
+    assert re.search(r"cx = (49|50|51)\.\d+ instead of 0", told)
+    sound = adjust_bundle(start, refined)
+    assert sound.doubt is None and not any("intrinsics" in note for note in sound.notes)
+
+
+@pytest.mark.parametrize("seed", [61, 65, 69])
+def test_pixels_of_bal_that_are_not_square_are_told(seed):
+    start = reconstruction(seed, "bal")
+    told = adjust_bundle(replace(start, pixels=start.pixels * [1.0, 1.1])).doubt
+    assert re.search(r"y stretched 1\.(09|1|11) times", told) and "correct the pixels" in told
+    sound = adjust_bundle(start)
+    assert sound.doubt is None and not any("lens" in note for note in sound.notes)
+
+
+def test_pixels_of_bal_that_are_counted_from_another_place_are_told():
+    """By cameras all around a cloud, which no turn of theirs explains away."""
+    rng = np.random.default_rng(5)
+    angle = np.linspace(0.0, 6.0, 12)
+    centers = np.column_stack([6.0 * np.cos(angle), 6.0 * np.sin(angle), rng.normal(0.0, 0.7, 12)])
+    z = -centers / np.linalg.norm(centers, axis=1, keepdims=True)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    R = np.stack([x, np.cross(z, x), z], axis=1)
+    T = np.hstack([quaternion.from_matrix(R), -np.einsum("nij,nj->ni", R, centers)])
+    camera_of, point_of = (grid.ravel() for grid in np.mgrid[:12, :200])
+    start = perturbed(rng, T, rng.uniform(-2.0, 2.0, (200, 3)), camera_of, point_of, "bal", 0.01, 0.05)
+    told = adjust_bundle(replace(start, pixels=start.pixels + np.array([-50.0, 0.0]))).doubt
+    shift = float(re.search(r"principal point at \((\S+), ", told)[1])
+    assert -60.0 < shift < -35.0
+    assert adjust_bundle(start).doubt is None
