@@ -22,7 +22,7 @@ from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.outliers.graduated import graduate
 from boxplus.optimization.outliers.inlier_report import InlierReport, inlier_report
 from boxplus.optimization.problem import Problem
-from boxplus.optimization.solution import Solution
+from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.variables import Variables
@@ -35,6 +35,8 @@ _KEEP = 0.999  # of true loops that the innovation keeps
 _JUDGED = 400  # refused loops that are judged by their innovation, the nearest ones
 _FAR = 100.0  # thresholds, squared, beyond which none is
 _ROUNDS = 3  # of readmission
+_TAKEN, _TRIED, _HOPELESS = 5, 20, 2.0  # steps over all loops, and times the verdict's objective, above which they do not agree
+_SAME = 1e-3  # relative difference up to which two objectives are one
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +61,11 @@ class LoopVerdict:
     poses: Variables
     widths: int
 
+    @property
+    def refuses_more_than_noise(self) -> bool:
+        """Whether more loops were refused than the search loses of true ones."""
+        return bool(1.0 - float(self.is_kept[self.is_loop].mean()) > 1.0 - _SEARCH)
+
 
 def judge_loops(
     graph: PoseGraph,
@@ -78,7 +85,7 @@ def judge_loops(
     """
     problem, poses = problem_with_loops_apart(graph, is_loop)
     group = problem.groups[-1]
-    search, keep = (math.sqrt(chi_square_quantile(p, group.residual.dim)) for p in (_SEARCH, _KEEP))
+    search = math.sqrt(chi_square_quantile(_SEARCH, group.residual.dim))
     # Odometry that holds everything together speaks first; else the loops are needed from the beginning.
     whole = len(np.unique(components(with_edges(graph, ~is_loop)))) == len(np.unique(components(graph)))
     found = graduate(
@@ -92,8 +99,69 @@ def judge_loops(
         callback=named(callback, "telling false loop closures from true ones"),
     )
     group.set_loss(Squared())
-    kept = found.inliers[LOOPS]
-    solution = _solve_kept(problem, group, kept, options, found.solution, callback)
+    return _settled(problem, poses, is_loop, found.inliers[LOOPS], found.solution, options, callback, len(found.levels))
+
+
+def judge_all_together(
+    graph: PoseGraph,
+    verdict: LoopVerdict,
+    start: NDArray[np.float64],
+    options: SolverOptions,
+    callback: Callback | None = None,
+) -> LoopVerdict:
+    """The verdict that follows from the least-squares minimum over all loops, where it is the better one; else the same.
+
+    Odometry that speaks first may wander so far that true loops fit no longer: long walks with noisy turns. Where nearly all
+    loops are true, their minimum is no worse, and truncated least squares says which of the two verdicts has the lower one.
+
+    Args:
+        verdict: of `judge_loops`.
+        start: poses that owe nothing to the odometry alone.
+
+    Raises:
+        SingularProblemError: see `Problem.solve`.
+    """
+    problem, poses = problem_with_loops_apart(graph, verdict.is_loop)
+    group, limit = problem.groups[-1], _truncated(verdict, graph.information.shape[1])
+    watch = named(callback, "over all loop closures")
+
+    taken = 0
+
+    def is_hopeless(step: Iteration) -> bool:
+        nonlocal taken
+        taken += step.number > 0 and step.accepted
+        is_late = taken >= _TAKEN or step.number >= _TRIED
+        return (watch is not None and bool(watch(step))) or (is_late and 2.0 * step.cost > _HOPELESS * limit)
+
+    solution = problem.solve(options, start=[start], callback=is_hopeless)
+    if solution.status == "stopped" and solution.limit != "steps":
+        return verdict
+    kept = group.squares(solution.values) <= chi_square_quantile(_SEARCH, group.residual.dim)
+    other = _settled(problem, poses, verdict.is_loop, kept, solution, options, callback, verdict.widths)
+    return other if _truncated(other, group.residual.dim) < (1.0 - _SAME) * limit else verdict
+
+
+def _truncated(verdict: LoopVerdict, dim: int) -> float:
+    """Σ r² of the odometry and Σ min(r², c²) of the loops: what graduated non-convexity minimises."""
+    squares = verdict.innovations**2
+    loops = np.minimum(squares[verdict.is_loop], chi_square_quantile(_SEARCH, dim))
+    return float(squares[~verdict.is_loop].sum() + loops.sum())
+
+
+def _settled(
+    problem: Problem,
+    poses: Variables,
+    is_loop: NDArray[np.bool_],
+    kept: NDArray[np.bool_],
+    solution: Solution,
+    options: SolverOptions,
+    callback: Callback | None,
+    widths: int,
+) -> LoopVerdict:
+    """The verdict that begins with the loops `kept`, and ends with those whose innovation lets them in again."""
+    group = problem.groups[-1]
+    keep = math.sqrt(chi_square_quantile(_KEEP, group.residual.dim))
+    solution = _solve_kept(problem, group, kept, options, solution, callback)
     for _ in range(_ROUNDS):
         if solution.status == "stopped":
             break
@@ -107,7 +175,7 @@ def judge_loops(
         innovations[rows] = np.sqrt(own.squares(solution.values))
     is_kept[is_loop] = kept
     report = inlier_report(innovations[is_loop] ** 2, group.residual.dim, keep, kept)
-    return LoopVerdict(is_loop, is_kept, innovations, report, solution, poses, len(found.levels))
+    return LoopVerdict(is_loop, is_kept, innovations, report, solution, poses, widths)
 
 
 def _solve_kept(

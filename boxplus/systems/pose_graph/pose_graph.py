@@ -192,6 +192,10 @@ def optimize_pose_graph(
     verdict = None
     if config.robust == "gnc" and starts.is_loop.any():
         verdict = judge_loops(graph, starts.is_loop, known[chosen], options, callback)
+        is_ended = verdict.solution.status != "stopped" or verdict.solution.limit == "steps"
+        if config.start == "auto" and is_ended and verdict.refuses_more_than_noise:
+            chosen, verdict = starts.all_together(chosen, verdict, known)
+            costs[chosen] = convex_cost(problem, [known[chosen]])
         poses = verdict.poses
         solution, minima = verdict.solution, {chosen: 2.0 * verdict.solution.cost}
         weights = verdict.is_kept.astype(np.float64)
@@ -353,6 +357,11 @@ def _reason(wanted: str, chosen: Start, costs: dict[Start, float], minima: dict[
         return f"{name}, as asked for; cost {costs[chosen]:.6g}"
     if chosen == "spanning_tree":
         return f"spanning tree, along the odometry, where no loop closure is believed yet; cost {costs[chosen]:.6g}"
+    if "spanning_tree" in costs:
+        return (
+            f"{name}, from where nearly all loop closures agree with each other and with the odometry, which by itself leads too "
+            f"far astray to judge them; cost {costs[chosen]:.6g}"
+        )
     if len(costs) == 1:
         return f"{name}, as the graph has no poses of its own; cost {costs[chosen]:.6g}"
     others = ", ".join(f"{cost:.6g} ({other})" for other, cost in costs.items() if other != chosen)

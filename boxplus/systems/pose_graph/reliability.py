@@ -34,6 +34,7 @@ Floats = NDArray[np.float64]
 _STRANGE = 1e-4  # chance that an edge of a sound graph, the worst of all, is told
 _SURE = 1e-6  # chance that anything else is
 _UNCHECKED = 1e-5  # share of an error that shows, below which nothing checks that direction
+_SHOWN = 1e-3  # share of a common error of all steps, below which the curvature of noisy poses shows as much of one
 _ROUNDING = 1e-15  # of the covariances that such a share is a small difference of
 _ALIKE = 9.2  # difference of squares by which one suspect is a hundred times likelier than another
 BENT = 4.0  # standard deviations of the result by which it has to be off, for it not to be trusted
@@ -230,7 +231,7 @@ def _systematic(known: Reliability, solution: Solution, variables: Variables, od
         (response,) = solution.response([slopes], is_determined=True)
         length = float((b * b).sum())
         spare = length - float((slopes * response).sum())
-        if not spare > _UNCHECKED * length:
+        if not spare > _SHOWN * length:
             continue
         size = float((b * known.errors).sum()) / spare
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -15,7 +15,7 @@ from boxplus.optimization.problem import Problem
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.pose_graph.bridges import Bridge, bridge_pieces
-from boxplus.systems.pose_graph.loops import LoopVerdict, judge_loops
+from boxplus.systems.pose_graph.loops import LoopVerdict, judge_all_together, judge_loops
 from boxplus.systems.pose_graph.named import named
 from boxplus.systems.pose_graph.problem import pose_graph_problem, with_edges
 from boxplus.systems.pose_graph.start import chordal_start, components, spanning_tree_start
@@ -126,6 +126,19 @@ class Starts:
                 best = (name, tried)
         # Also where `enough` was reached: of 8 walks of 0.35 and 0.4 rad of noise that had got there, 3 fell by 3 to 10 % more.
         return self._relaxed(*best, known, minima) if is_loud else best
+
+    def all_together(
+        self, first: Start, verdict: LoopVerdict, known: dict[Start, NDArray[np.float64]]
+    ) -> tuple[Start, LoopVerdict]:
+        """The verdict of all loop closures together, from the chordal start, where that is the better one.
+
+        Args:
+            first, verdict: the start that was followed, and its verdict.
+            known: starts by name; receives the one that is tried.
+        """
+        known["chordal"] = self._chordal_start()
+        other = judge_all_together(self._graph, verdict, known["chordal"], self._options, self._watch)
+        return (first, verdict) if other is verdict else ("chordal", other)
 
     def _relaxed(
         self,

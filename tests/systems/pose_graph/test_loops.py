@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from boxplus import InputError, PoseGraphConfig, losses, optimize_pose_graph
+from boxplus import InputError, PoseGraph, PoseGraphConfig, losses, optimize_pose_graph
 from boxplus.manifolds import se2, se3
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.simulation.pose_graphs import simulate_pose_graph, without_false_loops
+from boxplus.systems.pose_graph.loops import judge_all_together
 from boxplus.systems.pose_graph.problem import consecutive_edges, positions, with_edges
 
 GNC = PoseGraphConfig(robust="gnc")
@@ -51,6 +52,36 @@ def test_loops_are_judged_right_and_the_map_is_that_of_the_true_ones(dimension, 
     assert result.doubt is None and not result.fit.is_poor and result.start == "spanning_tree"
     np.testing.assert_array_equal(result.weights, result.loops.is_kept)
     np.testing.assert_allclose(result.loops.innovations, result.errors, rtol=1e-9, atol=1e-9)
+
+
+def _laps(sigma_rotation: float, seed: int) -> PoseGraph:
+    """Six laps of a circle, 400 poses, every one joined to that of the lap before; turns are noisy, and nothing is false."""
+    rng = np.random.default_rng(seed)
+    angle = 2.0 * np.pi * np.arange(400) / 66.0
+    truth = np.column_stack([angle + 0.5 * np.pi, 10.0 * np.cos(angle), 10.0 * np.sin(angle)])
+    edges = np.array([[k, k + 1] for k in range(399)] + [[k - 66, k] for k in range(66, 400)])
+    sigma = np.array([sigma_rotation, 0.02, 0.02])
+    exact = se2.compose(se2.inverse(truth[edges[:, 0]]), truth[edges[:, 1]])
+    measured = SE2.boxplus(exact, sigma * rng.standard_normal((len(edges), 3)))
+    information = np.tile(np.diag(sigma**-2.0), (len(edges), 1, 1))
+    return PoseGraph(2, np.arange(400), None, edges, measured, information, np.zeros(0, dtype=np.int64))
+
+
+@pytest.mark.parametrize("seed", [4, 7, 8])
+def test_true_loops_that_odometry_alone_led_away_from_are_kept(seed):
+    """What turns that err by 11 degrees a step lead to is no judge; all loop closures together are."""
+    graph = _laps(0.2, seed)
+    result, known = optimize_pose_graph(graph, GNC), optimize_pose_graph(graph)
+    assert result.loops.is_kept.mean() > 0.99 and result.doubt is None
+    assert result.start == "chordal" and "leads too far astray" in result.start_reason
+    assert result.chi2 < 1.05 * known.chi2
+
+
+def test_loops_that_are_half_false_are_not_believed_together():
+    simulated = simulate_pose_graph(dimension=2, poses=300, seed=3, false_share=0.5, false_kind="clustered", sigma_rotation=0.05)
+    first = optimize_pose_graph(simulated.graph, GNC).loops
+    start = optimize_pose_graph(simulated.graph, PoseGraphConfig(examine=False)).poses_start
+    assert judge_all_together(simulated.graph, first, start, GNC.solver) is first
 
 
 @pytest.mark.slow
