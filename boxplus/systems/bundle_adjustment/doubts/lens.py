@@ -93,6 +93,8 @@ def lens_finding(
     used, adjusted = _with_any_lens(adjusted, used)
     ask = partial(_freed, adjusted, used, dropped, config, loss, solved, left, count, watch)
     if isinstance(given, BalProblem):
+        if solved.status != "converged":  # steps that were not taken may halve the cost as well
+            return None
         return _finding_of_bal(adjusted, ask(free | {"cx, cy"}, least=_HALF, looks=2, hint=1.0), cost)
     # Distortion alone first: few images tell it well, and focal lengths and principal point, beside which it gets lost, hardly.
     wanted = (free | _RADIAL, frozenset(PARTS))
