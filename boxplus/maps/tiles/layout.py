@@ -34,12 +34,14 @@ class Manifest:
         voxel_m: edge of the voxels that hold one point each [m], or None when every point was kept.
         intensity: whether the points have intensities; None until the first points came.
         closed: whether the writer came to its regular end.
+        segments: files that it left then, of all tiles; None where it did not come to its end.
     """
 
     tile_size_m: float
     voxel_m: float | None
     intensity: bool | None = None
     closed: bool = False
+    segments: int | None = None
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
@@ -65,8 +67,10 @@ def read_manifest(folder: Path) -> Manifest:
         if content.pop("format") != _FORMAT or content.pop("version") != _VERSION:
             raise ValueError
         manifest = Manifest(**content)
-        size, voxel = manifest.tile_size_m, manifest.voxel_m
+        size, voxel, segments = manifest.tile_size_m, manifest.voxel_m, manifest.segments
         if not (isinstance(size, int | float) and size > 0 and (voxel is None or (isinstance(voxel, int | float) and voxel > 0))):
+            raise ValueError
+        if not (segments is None or (type(segments) is int and segments >= 0)):
             raise ValueError
     except OSError as error:
         raise InputError(

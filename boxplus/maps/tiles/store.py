@@ -78,10 +78,12 @@ class TileStore:
         if not manifest.closed:
             report.append("the run that wrote this map did not close it: it was interrupted, or is still going on")
         segments: dict[TileIndex, list[Path]] = {}
+        present = 0
         counts: dict[TileIndex, int] = {}
         written: set[tuple[TileIndex, int]] = set()
         for index in list_tiles(base):
             for generation, path in list_segments(base, index).items():
+                present += 1
                 try:
                     count = ply_vertex_count(path)
                 except InputError as error:
@@ -93,6 +95,11 @@ class TileStore:
             torn = list(tile_folder(base, index).glob(f"*{TEMPORARY_SUFFIX}"))
             if torn:
                 report.append(f"{torn[0]} was being written when the run ended; its points are read from the journal")
+        if manifest.segments is not None and present < manifest.segments:
+            damage.append(
+                f"{manifest.segments - present} of the {manifest.segments} segments that were written are not there, and what "
+                "they held is not in the map: put the files back, or copy the folder anew"
+            )
         unsorted: dict[TileIndex, list[NDArray[np.float32]]] = {}
         for generation, path in list_journals(base).items():
             records, cut = read_journal(path)

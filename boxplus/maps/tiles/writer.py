@@ -116,7 +116,7 @@ class TileWriter:
                 f"tile_size {tile_size} m and voxel {voxel}",
                 "use the same settings to continue that map, or another folder",
             )
-        return replace(manifest, closed=False)
+        return replace(manifest, closed=False, segments=None)
 
     def _recover(self) -> int:
         """Finish what an interrupted run left behind; returns the next generation."""
@@ -262,12 +262,16 @@ class TileWriter:
             if self._failure is None:
                 self._attempt(self._hand_over)
                 self._attempt(self._wait)
-                self._attempt(lambda: write_manifest(self.folder, replace(self._manifest, closed=True)))
+                self._attempt(self._write_closed)
         finally:
             self._worker.shutdown(wait=True)
             if self._journal is not None:
                 self._journal.close()
                 self._journal = None
+
+    def _write_closed(self) -> None:
+        segments = sum(len(list_segments(self.folder, index)) for index in list_tiles(self.folder))
+        write_manifest(self.folder, replace(self._manifest, closed=True, segments=segments))
 
     def __enter__(self) -> TileWriter:
         return self

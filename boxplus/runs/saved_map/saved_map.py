@@ -12,6 +12,7 @@ from boxplus._arguments import as_settings
 from boxplus.errors import InputError
 from boxplus.formats.clouds.cloud_file import CLOUD_ENDINGS, read_cloud
 from boxplus.formats.clouds.las import read_survey
+from boxplus.formats.clouds.point_cloud import FARTHEST_M
 from boxplus.formats.output import advice_to_put_back
 from boxplus.formats.trajectory import Trajectory
 from boxplus.maps.local_maps.config import LocalMapConfig
@@ -91,7 +92,7 @@ def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> Sa
     report, damage, doubts, accepted = list[str](), list[str](), list[str](), list[str]()
     kind, trajectories, origin = "point cloud", list[Trajectory](), np.zeros(3)
     if base.is_file():
-        points, origin = _of_file(base, config.voxel)
+        points, origin = _of_file(base, config.voxel, damage)
         if (run := run_of_map(base)) is not None:
             doubts, accepted = doubts_of(run.summary)
         if origin.any():
@@ -181,7 +182,7 @@ def _of_tiles(folder: Path, voxel: float, report: list[str], damage: list[str]) 
     return TiledPoints(store.counts, store.manifest.tile_size_m, read)
 
 
-def _of_file(path: Path, voxel: float) -> tuple[TiledPoints, NDArray[np.float64]]:
+def _of_file(path: Path, voxel: float, damage: list[str]) -> tuple[TiledPoints, NDArray[np.float64]]:
     """A cloud is kept in memory as a whole, thinned; and the origin (3,) that it is counted from."""
     origin, ending = np.zeros(3), path.suffix.lower()
     if ending not in CLOUD_ENDINGS:
@@ -191,5 +192,20 @@ def _of_file(path: Path, voxel: float) -> tuple[TiledPoints, NDArray[np.float64]
     else:
         cloud = read_cloud(path)
     points = cloud.points[np.isfinite(cloud.points).all(axis=1)]
+    # A few are markers of no return (1e30); all of them are of a map projection, and lost their digits as they were written.
+    is_near = (np.abs(points) <= FARTHEST_M).all(axis=1)
+    if far := len(points) - int(np.count_nonzero(is_near)):
+        farthest = float(np.abs(points).max())
+        if 2 * far > len(points):
+            raise InputError(
+                f"coordinates within {FARTHEST_M / 1e3:.0f} km of the origin, which float32 holds to 4 mm",
+                f"{far} of {len(points)} points farther away, up to {farthest:.0f} m, which it holds to "
+                f"{np.spacing(np.float32(farthest)):.2g} m ({path})",
+                "subtract a local origin from them before they are written as float32",
+            )
+        damage.append(
+            f"{far} of {len(points)} points lie farther than {FARTHEST_M / 1e3:.0f} km from the origin and are left out"
+        )
+        points = points[is_near]
     tiles = dict(split_by_tile(points[first_per_voxel(points, voxel)], _TILE))
     return TiledPoints(tiles, _TILE, lambda index: tiles[index]), origin

@@ -21,7 +21,7 @@ from boxplus.errors import InputError, OutputError
 from boxplus.formats.clouds.pcd import read_pcd
 from boxplus.formats.clouds.ply import PlyWriter, read_ply
 from boxplus.maps.tiles.journal import read_journal
-from boxplus.maps.tiles.layout import list_journals
+from boxplus.maps.tiles.layout import list_journals, read_manifest
 from boxplus.maps.tiles.store import TileStore, merge
 from boxplus.maps.tiles.voxel_thinning import RecentVoxels, first_per_voxel
 from boxplus.maps.tiles.writer import TileWriter
@@ -266,8 +266,13 @@ def test_a_map_is_continued_only_with_its_own_settings(tmp_path: Path) -> None:
             TileWriter(tmp_path / "other", **settings_)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": "other"}', '{"format": "boxplus-map-tiles", "version": 2}', "\0"])
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"format": "other"}', '{"format": "boxplus-map-tiles", "version": 2}', "\0", "segments"]
+)
 def test_damaged_manifest(tmp_path: Path, text: str) -> None:
+    if text == "segments":
+        whole = {"format": "boxplus-map-tiles", "version": 1, "tile_size_m": 50.0, "voxel_m": None}
+        text = json.dumps({**whole, "segments": "3"})
     (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(InputError, match=r"a manifest\.json of a version 1 map – got something else"):
         TileStore.open(tmp_path)
@@ -296,6 +301,20 @@ def test_a_damaged_segment_is_left_out_and_named(tmp_path: Path) -> None:
     assert store.point_count == 7
     assert len(store.report) == 1
     assert store.report[0].startswith("a segment is damaged and left out: expected 5 points, as the header says – got 4")
+
+
+def test_missing_segments_are_counted_and_a_map_that_is_continued_counts_anew(tmp_path: Path) -> None:
+    points = cloud(4000, seed=9)
+    for part in (points[:2000], points[2000:]):
+        with TileWriter(tmp_path, tile_size=50.0) as writer:
+            writer.append(part)
+            assert read_manifest(tmp_path).segments is None
+    files = sorted((tmp_path / "tiles").glob("*/*.ply"))
+    assert read_manifest(tmp_path).segments == len(files) and TileStore.open(tmp_path).damage == ()
+    for gone, file in enumerate(files[:3], start=1):
+        file.unlink()
+        (damage,) = TileStore.open(tmp_path).damage
+        assert damage.startswith(f"{gone} of the {len(files)} segments that were written are not there")
 
 
 def test_merge(tmp_path: Path) -> None:

@@ -124,6 +124,37 @@ def test_a_bare_cloud_has_places_over_its_ground(tmp_path: Path, suffix: str) ->
     assert any("no trajectory" in text and "z is taken to be up" in text for text in saved.report)
 
 
+@pytest.mark.parametrize("far", [7e5, 3.4e38])
+def test_points_that_are_none_take_nothing_of_a_cloud(tmp_path: Path, far: float) -> None:
+    """Drivers write the largest number for no return: it is left out, and all others stay."""
+    write_ply(tmp_path / "cloud.ply", two_rooms())
+    write_ply(tmp_path / "marked.ply", np.concatenate([two_rooms(), [[far, 0.0, 0.0], [0.0, 0.0, -far]]]))
+    whole, marked = (open_saved_map(tmp_path / f"{name}.ply", CONFIG) for name in ("cloud", "marked"))
+    assert marked.damage == [f"2 of {len(two_rooms()) + 2} points lie farther than 66 km from the origin and are left out"]
+    assert whole.damage == [] and len(marked.local_maps) == len(whole.local_maps)
+    np.testing.assert_array_equal(marked.points_near([6.0, 8.0, 1.0], 30.0), whole.points_near([6.0, 8.0, 1.0], 30.0))
+
+
+def test_a_cloud_whose_digits_were_lost_is_refused(tmp_path: Path) -> None:
+    """Eastings and northings written as float32 lie on a grid of half a metre."""
+    write_ply(tmp_path / "utm.ply", two_rooms() + np.array([5e5, 5.4e6, 0.0]))
+    with pytest.raises(InputError, match=r"points farther away, up to 54000\d\d m, which it holds to 0\.5 m .*utm\.ply"):
+        open_saved_map(tmp_path / "utm.ply", CONFIG)
+
+
+def test_missing_tiles_are_counted(tmp_path: Path) -> None:
+    write_run(tmp_path / "run", two_rooms())
+    tiles = sorted((tmp_path / "run" / "map" / "tiles").iterdir())
+    assert open_saved_map(tmp_path / "run", CONFIG).damage == []
+    shutil.rmtree(tiles[0])
+    (damage,) = open_saved_map(tmp_path / "run", CONFIG).damage
+    assert damage.startswith(f"1 of the {len(tiles)} segments that were written are not there")
+    for tile in tiles[1:]:
+        shutil.rmtree(tile)
+    with pytest.raises(InputError, match=f"none in .*run – {len(tiles)} of the {len(tiles)} segments"):
+        open_saved_map(tmp_path / "run", CONFIG)
+
+
 def test_a_damaged_tile_is_named_and_the_rest_is_used(tmp_path: Path) -> None:
     write_run(tmp_path / "run", two_rooms())
     segments = sorted((tmp_path / "run" / "map" / "tiles").glob("*/*.ply"))
