@@ -120,6 +120,7 @@ def gnss_facts(topic: str, found: Georeference, correction: Correction) -> GnssF
         delay_s=fit.delay,
         delay_sigma_s=fit.delay_sigma,
         noise_scale=fit.noise_scale,
+        height_scale=fit.height_scale,
     )
 
 

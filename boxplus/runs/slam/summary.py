@@ -37,6 +37,7 @@ class GnssFacts(Part):
     delay_s: float | None = Field(None, description="by which fixes are stamped late")
     delay_sigma_s: float | None = None
     noise_scale: float | None = Field(None, description="factor of the standard deviations that the receiver states")
+    height_scale: float | None = Field(None, description="and that of the heights beside it; 1 but where they scatter far more")
 
 
 class SlamSummary(Part):

@@ -11,6 +11,7 @@ from boxplus.manifolds import quaternion
 from boxplus.systems.georeference.attachment import AttachedFixes
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.georeference.fit import Fit
+from boxplus.systems.georeference.heights import height_jump
 from boxplus.systems.georeference.jump import Jump
 from boxplus.systems.georeference.plateau import Plateau
 
@@ -105,12 +106,30 @@ def doubts_of(
             f"fixes scatter {found.noise_scale:.1f} times as much as they claim, or the odometry does between two local maps; "
             "they are believed that much less"
         )
+    if found.height_scale > 1.0:
+        warnings.append(
+            f"heights of the fixes scatter {found.height_scale * found.noise_scale:.1f} times as much as they claim, and the "
+            f"places {found.noise_scale:.1f} times: heights are believed that much less{_where_heights_jump(attached, found)}"
+        )
     if found.tension > _BENT:
         warnings.append(
             f"fixes bend the odometry {math.sqrt(found.tension):.1f} times as much as its covariance allows: it drifts more than "
             "claimed, or the fixes have another scale or datum"
         )
     return warnings
+
+
+def _where_heights_jump(attached: AttachedFixes, found: Fit) -> str:
+    """Where another reference of heights begins, which is nothing of the places."""
+    seconds = (attached.time_ns - attached.time_ns[0]) * 1e-9
+    jump = height_jump(-found.errors[:, 2])
+    if jump is None:
+        return ""
+    at, metres = jump
+    return (
+        f"; they jump by {metres:+.1f} m at {seconds[at]:.0f} s: another reference of heights from there on (the sea in place of "
+        "the ellipsoid), or another base station"
+    )
 
 
 def _or_lever(attached: AttachedFixes, found: Fit) -> str:

@@ -31,6 +31,9 @@ Floats = NDArray[np.float64]
 
 _DAMPING = 1e-9
 _MEDIAN_SQUARE = 2.366  # of a normal vector of three
+_MEDIAN_ON_GROUND = 1.386  # of one of two
+_QUARTER, _UPPER_SQUARE = 0.75, 1.323  # of a normal number: where a map lies at one of two heights, half of the others fit
+_HEIGHTS_APART = 3.0  # times what places scatter by, and as many as they claim: heights are then believed less by themselves
 _ROUNDS = 4
 _SETTLED = 1.1
 OFF_SIGMAS = 3.0
@@ -50,7 +53,8 @@ class Fit:
         delay, delay_sigma: by which fixes are stamped late [s].
         is_used: (N,) which fixes the result rests on. errors: (N, 3) predicted less measured, east, north, up [m].
         fix_covariance: (N, 3, 3) of a fix as it was believed, beside those near to it in time [m²].
-        noise_scale: factor of the standard deviations that the fixes needed, at least 1.
+        noise_scale: factor of the standard deviations that the fixes needed, at least 1; height_scale: that of their heights
+            beside it, where these scatter by far more than the places do, else 1.
         tension: mean square of the odometry's errors, in variances per direction; far below 1 where nothing bends it.
         datum_step: (3,) what the second datum is shifted by against the first, east, north, up [m]; zero where there is one.
     """
@@ -67,6 +71,7 @@ class Fit:
     errors: Floats
     fix_covariance: Floats
     noise_scale: float
+    height_scale: float
     tension: float
     datum_step: Floats
 
@@ -116,7 +121,7 @@ def fit(
     spacing = float(np.median(np.diff(attached.time_ns))) * 1e-9
     inflation = math.sqrt(max(config.correlation / spacing, 1.0))
     threshold = math.sqrt(chi_square_quantile(config.inlier, 3))
-    noise_scale = 1.0
+    noise_scale = height_scale = 1.0
     arm_start = np.zeros((1, 3)) if lever is None else lever[None]
     start = [graph.T_map, np.repeat(T_enu_map[None], datums, axis=0), arm_start, np.zeros((1, 1))]
     for _ in range(_ROUNDS):
@@ -135,7 +140,8 @@ def fit(
             problem.add_residuals(Prior(Euclidean(3), np.zeros(3), sigma=config.lever_sigma), arm, name="lever arm")
         else:
             problem.fix(arm)
-        covariance = (inflation * noise_scale) ** 2 * attached.covariance
+        axes = inflation * noise_scale * np.array([1.0, 1.0, height_scale])
+        covariance = axes[:, None] * attached.covariance * axes
         residual = AntennaPosition(p_enu, attached.T_map_imu, attached.v_map, covariance=covariance)
         every = np.zeros(len(attached), dtype=np.intp)
         fixes = problem.add_residuals(residual, world[datum], x[attached.map_of], arm[every], delay[every], name="fixes")
@@ -146,6 +152,12 @@ def fit(
         )  # fmt: skip
         used = found.inliers["fixes"]
         squares = fixes.squares(found.solution.values) * inflation**2
+        T_enu, T_map, lever_now, late = (found.solution[own] for own in (world, x, arm, delay))
+        errors = residual.evaluate(T_enu[datum], T_map[attached.map_of], lever_now[0], late[0])[believed]
+        on_ground, of_height = _scatter(errors, covariance[believed] / inflation**2)
+        if of_height > _HEIGHTS_APART * max(on_ground, 1.0):  # of another reference, say; the places are good all the same
+            height_scale *= of_height / max(on_ground, 1.0)
+            continue
         # Of those the start rests on, not of those that were kept: what is cut off at a threshold always looks quiet.
         scatter = math.sqrt(float(np.median(squares[believed])) / _MEDIAN_SQUARE)
         if scatter <= _SETTLED:
@@ -154,7 +166,19 @@ def fit(
     fixes.set_loss(Squared())
     problem.set_weights(fixes, used.astype(np.float64))
     solution = problem.solve(options, start=found.solution)
-    return _result(solution, problem, x, (world, arm, delay), residual, attached, datum, used, covariance, noise_scale)
+    return _result(
+        solution, problem, x, (world, arm, delay), residual, attached, datum, used, covariance, (noise_scale, height_scale)
+    )
+
+
+def _scatter(errors: Floats, covariance: Floats) -> tuple[float, float]:
+    """By how many of their standard deviations errors (N, 3) scatter, on the ground and in height."""
+    ground = np.linalg.solve(covariance[:, :2, :2], errors[:, :2, None])[..., 0]
+    squares, of_height = np.einsum("na,na->n", errors[:, :2], ground), errors[:, 2] ** 2 / covariance[:, 2, 2]
+    return (
+        math.sqrt(float(np.median(squares)) / _MEDIAN_ON_GROUND),
+        math.sqrt(float(np.quantile(of_height, _QUARTER)) / _UPPER_SQUARE),
+    )
 
 
 def _result(
@@ -167,7 +191,7 @@ def _result(
     datum: NDArray[np.intp],
     used: NDArray[np.bool_],
     fix_covariance: Floats,
-    noise_scale: float,
+    scales: tuple[float, float],
 ) -> Fit:
     world, arm, delay = others
     T_map, T_enu, lever = solution[x], solution[world], solution[arm][0]
@@ -186,7 +210,8 @@ def _result(
         is_used=used,
         errors=errors,
         fix_covariance=fix_covariance,
-        noise_scale=noise_scale,
+        noise_scale=scales[0],
+        height_scale=scales[1],
         tension=tension,
         datum_step=T_enu[-1, 4:] - T_enu[0, 4:],
     )

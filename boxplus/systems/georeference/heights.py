@@ -26,6 +26,8 @@ _LEAST = 0.2  # of b from 1: less than that is no other unit
 _SIGMAS_STATED = 2.0  # where the noise that is stated bears out a unit, and
 _AS_STATED, _BEYOND = 1.5, 3.0  # times that noise, what the heights scatter by in that unit at most, and as they are at least
 _FOOT = 0.3048
+_FEWEST = 5  # fixes on either side of a jump
+_EXPLAINED = 0.8  # of what heights are off by, for a jump to be what it is
 _UNITS = (1.0 / _FOOT, _FOOT)
 _KNOWN = {
     1.0 / _FOOT: "they are in feet",
@@ -96,3 +98,22 @@ def climb_of(p_level: Floats, up: Floats, drift: Floats, noise: float, seconds: 
         None,
     )
     return Climb(ratio, sigma, unit)
+
+
+def height_jump(off: Floats) -> tuple[int, float] | None:
+    """The row from which heights that are off (N,) [m] are so by another level, and by how much it is higher [m].
+
+    None where one jump does not explain most of it: noise, and levels that come and go.
+    """
+    n = len(off)
+    if n < 2 * _FEWEST:
+        return None
+    off = off - off[0]  # of one level exactly nothing is left, and no rounding
+    after = np.arange(_FEWEST, n - _FEWEST + 1)
+    before = np.cumsum(off)[after - 1]
+    step = (off.sum() - before) / (n - after) - before / after
+    explained = step**2 * after * (n - after) / n
+    best = int(np.argmax(explained))
+    if explained[best] < _EXPLAINED * float(((off - off.mean()) ** 2).sum()) or not step[best]:
+        return None
+    return int(after[best]), float(step[best])

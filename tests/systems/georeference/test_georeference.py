@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given as drawn
+from hypothesis import strategies as st
 
 from boxplus.errors import SingularProblemError
 from boxplus.manifolds import quaternion, se3
@@ -18,6 +20,7 @@ from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.georeference.doubts import contradiction_of, doubts_of, gated_stretches
 from boxplus.systems.georeference.fit import Fit, level
 from boxplus.systems.georeference.georeference import Georeference, georeference
+from boxplus.systems.georeference.heights import height_jump
 from boxplus.systems.georeference.jump import jump_of
 from boxplus.systems.georeference.plateau import plateau_of
 from boxplus.systems.georeference.start import find_start
@@ -432,6 +435,43 @@ def test_heights_that_do_not_go_along_are_named_where_the_way_climbs(climbs: boo
     said = [text for text in result.warnings if text.startswith("heights of the fixes go")]
     assert len(said) == (says is not None and climbs)
     assert all(says is not None and says in text for text in said)
+
+
+@pytest.mark.parametrize("begin", [0.35, 0.5, 0.65])
+@pytest.mark.parametrize("receiver", [{}, {**PRECISE}, {"sigma": 0.2, "slow_sigma": 0.2}])
+def test_heights_of_another_reference_leave_places_as_they_are_and_are_named(
+    laps: Drive, receiver: dict[str, object], begin: float
+) -> None:
+    """From the ellipsoid to the sea on the way: half of the fixes were gated, or all places believed less."""
+    config = GOOD.model_copy(update=receiver)
+    fixes = laps.fixes(config)
+    lla, first = fixes.lat_lon_alt.copy(), int(begin * len(fixes.time_ns))
+    lla[first:, 2] -= 47.0
+    given = replace(fixes, lat_lon_alt=lla)
+    result, sound = georeference(laps.graph, given, laps.time_ns, laps.T_odo_imu, None, np.array(LEVER)), found(laps, config)
+    assert result.fit is not None and sound.fit is not None and sound.fit.height_scale == 1.0
+    assert result.used >= 0.9 * len(result.attached)
+    assert np.median(result.fit.sigma) < 2.0 * np.median(sound.fit.sigma)
+    assert (laps.off(result) < 4.0 * np.sqrt(2.0) * result.fit.sigma).all()
+    (said,) = [text for text in result.warnings if text.startswith("heights of the fixes scatter")]
+    metres, seconds = map(float, re.search(r"they jump by ([-+.0-9]+) m at (\d+) s", said).groups())  # type: ignore[union-attr]
+    assert abs(metres + 47.0) < 6.0 and abs(seconds - 1e-9 * (fixes.time_ns[first] - fixes.time_ns[0])) < 3.0
+
+
+@drawn(
+    level=st.floats(-5.0, 5.0), step=st.floats(0.5, 50.0), sign=st.sampled_from([-1.0, 1.0]), at=st.integers(5, 35),
+    seed=st.integers(0, 99),
+)  # fmt: skip
+def test_a_jump_of_heights_is_found_where_it_is_and_noise_and_bursts_are_none(
+    level: float, step: float, sign: float, at: int, seed: int
+) -> None:
+    noise = np.random.default_rng(seed).normal(0.0, 0.03, 40)
+    rows = np.arange(40)
+    found_at = height_jump(level + noise + sign * step * (rows >= at))
+    assert found_at is not None and found_at[0] == at and abs(found_at[1] - sign * step) < 0.1
+    assert height_jump(level + noise) is None
+    assert height_jump(level + noise + sign * step * ((rows >= 14) & (rows < 27))) is None
+    assert height_jump((level + noise)[:9]) is None and height_jump(np.full(40, level)) is None
 
 
 @pytest.mark.parametrize("feet", [True, False])
