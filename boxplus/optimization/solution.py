@@ -207,6 +207,11 @@ class Solution:
         diagonal = np.einsum("kii->ki", self.covariance(selected))
         return np.asarray(np.sqrt(diagonal))
 
+    @property
+    def is_broken_off(self) -> bool:
+        """Whether the callback or the time limit stopped it, and not the limit of steps: who does that does not wait for more."""
+        return self.status == "stopped" and self.limit != "steps"
+
     def undetermined(self) -> list[str]:
         """A sentence for every way in which the residuals let variables move freely at the solution.
 

@@ -36,6 +36,7 @@ _KEYS: dict[Cause, tuple[str, str]] = {
     "corrected_points": ("point_times", "points corrected before"),
 }
 """Key and value of the evidence that a contradiction becomes."""
+_DECISIVE = {"gyro_scale", "same_platform", "points_mirrored", "point_times"}  # with these nothing else can be judged
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +87,7 @@ def check_agreement(
         ("gravity_sign", lambda: _force_sign(compared)),
         ("length_scale", lambda: _lengths(compared)),
     ]
-    if not {"gyro_scale", "same_platform", "points_mirrored", "point_times"} & set(
-        found
-    ):  # with these nothing else can be judged
+    if not _DECISIVE & set(found):
         for key, check in checks:
             if key not in found:
                 found[key] = check()

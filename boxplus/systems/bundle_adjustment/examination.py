@@ -65,8 +65,7 @@ def examination_options(
     limit_s = config.solver.time_limit_s
     if limit_s is not None:
         limit_s -= solved.history[-1].time_s
-    is_at_end = solved.status != "stopped" or solved.limit == "steps"
-    if watch.is_stopped or not is_at_end or (limit_s is not None and limit_s <= 0.0):
+    if watch.is_stopped or solved.is_broken_off or (limit_s is not None and limit_s <= 0.0):
         return None
     work = sum(group.residual.count for group in problem.groups) + cameras**3 // _CUBE
     steps = min(_STEPS, max(solved.iterations, _LEAST_WORK // max(work, 1), 1))

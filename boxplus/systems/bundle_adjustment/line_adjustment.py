@@ -128,9 +128,8 @@ def adjust_lines(
         empty if points is None else _point_errors(data, v[cameras.number], v[points.number]) for v in (start, values)
     )
     said = [_doubt(adjusted, errors, point_errors, seen, config, loss)]
-    is_stopped = solution.status == "stopped" and solution.limit != "steps"  # who does that does not wait
     watch = Watch(callback)
-    if not is_stopped and not line_parallax_ratio(adjusted, seen, config, loss, solution.cost, watch) > TURNING:
+    if not solution.is_broken_off and not line_parallax_ratio(adjusted, seen, config, loss, solution.cost, watch) > TURNING:
         said.append(NOT_APART)  # no minimum, either, and more steps lead to none
     else:
         said.append(solution.unconverged())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -132,6 +133,14 @@ def free_parameters(
     return free, layout[:, ~free] @ model.camera_params[number][~free], layout[:, free]
 
 
+def _refined_intrinsics(model: ColmapModel, problem: Problem, solution: Solution) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    """Which camera, and what came out of its parameters that were refined, of those that have any."""
+    numbers = {_intrinsics_name(name): number for number, name in enumerate(model.camera_ids)}
+    for block in problem.blocks:
+        if block.name in numbers:
+            yield numbers[block.name], solution[block][0]
+
+
 def turned_lenses(
     reconstruction: Reconstruction, config: BundleAdjustmentConfig, problem: Problem, solution: Solution, cameras: Variables
 ) -> tuple[list[tuple[int, float]], int]:
@@ -139,13 +148,10 @@ def turned_lenses(
     if isinstance(reconstruction, BalProblem):
         lengths = dict(enumerate(solution[cameras][:, _FOCAL]))
     elif isinstance(reconstruction, ColmapModel) and config.intrinsics == "refined":
-        names = {_intrinsics_name(name): (name, number) for number, name in enumerate(reconstruction.camera_ids)}
         lengths = {}
-        for block in problem.blocks:
-            if block.name in names:
-                name, number = names[block.name]
-                _, offset, basis = free_parameters(reconstruction, number, config)
-                lengths[int(name)] = float((offset + basis @ solution[block][0])[:2].min())
+        for number, intrinsics in _refined_intrinsics(reconstruction, problem, solution):
+            _, offset, basis = free_parameters(reconstruction, number, config)
+            lengths[int(reconstruction.camera_ids[number])] = float((offset + basis @ intrinsics)[:2].min())
     else:
         lengths = {}
     return [(name, float(f)) for name, f in lengths.items() if not f > 0.0], len(lengths)
@@ -177,11 +183,8 @@ def adjusted_reconstruction(
     if isinstance(reconstruction, GbpProblem):
         return replace(reconstruction, T_camera_world=T, points=p_world)
     params = [array.copy() for array in reconstruction.camera_params]
-    names = {_intrinsics_name(name): number for number, name in enumerate(reconstruction.camera_ids)}
-    for block in problem.blocks:
-        if block.name in names:
-            number = names[block.name]
-            params[number][free_parameters(reconstruction, number, config)[0]] = solution[block][0]
+    for number, intrinsics in _refined_intrinsics(reconstruction, problem, solution):
+        params[number][free_parameters(reconstruction, number, config)[0]] = intrinsics
     mean = mean_error_of_points(len(p_world), errors, point_of)
     known = np.where(np.isfinite(mean), mean, -1.0)
     return replace(reconstruction, T_camera_world=T, points=p_world, camera_params=tuple(params), errors=known)

@@ -23,7 +23,6 @@ from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compa
 _CLEARLY = 0.9  # of the misfit, with points left as they are: of corrected ones 0.62 to 0.83, of others 1.16 and more
 _DOUBTFUL_S = 0.008  # offset of the clocks that is worth a second look
 _EXPLAINED = 0.8
-_KNOWN_S = 0.012
 _INSTANTS = {-0.5: "its beginning", 0.0: "its middle", 0.5: "its end"}  # in lengths of the scan after its middle
 _AT_AN_END = 0.25  # of a scan, within which an instant is its beginning, middle or end
 
@@ -90,5 +89,5 @@ def corrected_points(
     if as_they_are > _CLEARLY * corrected or turned is None or turned.explained < _EXPLAINED:
         return None
     lengths = [scan.end_ns - scan.start_ns for scan in scans]
-    instant_s = turned.offset_s if turned.offset_std_s < _KNOWN_S else None
+    instant_s = turned.offset_s if turned.knows_offset else None
     return CorrectedPoints(as_they_are, corrected, instant_s, float(np.median(lengths)) * 1e-9)

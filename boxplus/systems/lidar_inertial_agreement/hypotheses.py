@@ -40,7 +40,6 @@ _REVERSED = 0.6  # a sign is told from its opposite by less than a scale from an
 _SCALE_OFF = 0.12
 _AS_WELL = 0.02  # of what is explained, by a mirror and by a mounting: turns about one axis do not tell them apart
 _OFFSET_OK_S = 0.014
-_OFFSET_STD_S = 0.012
 _SLOPE_OF_MANY_FLOOR = 0.03
 _FITS_OF_MANY = 0.7
 _FARTHEST_REVERSED = 4.5  # feet, and a third of it
@@ -102,7 +101,7 @@ def judges_rotation(agreement: Agreement) -> bool:
 
 def judges_clocks(rotation: RotationFit) -> bool:
     """Whether the motion shows the offset of the clocks."""
-    return _turning(rotation) and rotation.explained > _CLOSELY and rotation.offset_std_s < _OFFSET_STD_S
+    return _turning(rotation) and rotation.explained > _CLOSELY and rotation.knows_offset
 
 
 def judges_lengths(agreement: Agreement) -> bool:

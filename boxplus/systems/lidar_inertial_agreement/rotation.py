@@ -20,6 +20,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 
 _LARGEST_OFFSET_S = 0.6
+_OFFSET_KNOWN_S = 0.012
 _OFFSET_STEP_S = 0.02
 FEWEST_INTERVALS = 8
 SCALE = 6  # its row of the covariance
@@ -82,6 +83,11 @@ class RotationFit:
     @property
     def offset_std_s(self) -> float:
         return float(np.sqrt(self.covariance[7, 7]))
+
+    @property
+    def knows_offset(self) -> bool:
+        """Whether the offset of the clocks is known well enough to be told."""
+        return self.offset_std_s < _OFFSET_KNOWN_S
 
     @property
     def scale_std(self) -> float:

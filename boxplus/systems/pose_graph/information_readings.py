@@ -135,7 +135,7 @@ def information_doubt(
         try:
             problem, anew = pose_graph_problem(other, held=held, loss=None, objective="logarithm")
             found = problem.solve(options.model_copy(update={"max_iterations": _STEPS}), start=[poses], callback=watch)
-            if found.status == "stopped" and found.limit != "steps" and not is_hopeless:
+            if found.is_broken_off and not is_hopeless:
                 return None
             is_near = _AS_PROMISED[0] < 2.0 * found.cost / dof < _AS_PROMISED[1]  # what is known of each part takes longest
             reliability = Reliability.of(other, found, anew) if is_near else None

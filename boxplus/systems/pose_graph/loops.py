@@ -64,7 +64,7 @@ class LoopVerdict:
     @property
     def refuses_more_than_noise(self) -> bool:
         """Whether more loops were refused than the search loses of true ones."""
-        return bool(1.0 - float(self.is_kept[self.is_loop].mean()) > 1.0 - _SEARCH)
+        return bool(self.is_kept[self.is_loop].mean() < _SEARCH)
 
 
 def judge_loops(
@@ -122,10 +122,9 @@ def judge_all_together(
         SingularProblemError: see `Problem.solve`.
     """
     problem, poses = problem_with_loops_apart(graph, verdict.is_loop)
-    group, limit = problem.groups[-1], _truncated(verdict, graph.information.shape[1])
-    watch = named(callback, "over all loop closures")
-
-    taken = 0
+    group = problem.groups[-1]
+    limit = _truncated(verdict, group.residual.dim)
+    watch, taken = named(callback, "over all loop closures"), 0
 
     def is_hopeless(step: Iteration) -> bool:
         nonlocal taken
@@ -134,7 +133,7 @@ def judge_all_together(
         return (watch is not None and bool(watch(step))) or (is_late and 2.0 * step.cost > _HOPELESS * limit)
 
     solution = problem.solve(options, start=[start], callback=is_hopeless)
-    if solution.status == "stopped" and solution.limit != "steps":
+    if solution.is_broken_off:
         return verdict
     kept = group.squares(solution.values) <= chi_square_quantile(_SEARCH, group.residual.dim)
     other = _settled(problem, poses, verdict.is_loop, kept, solution, options, callback, verdict.widths)

@@ -192,8 +192,7 @@ def optimize_pose_graph(
     verdict = None
     if config.robust == "gnc" and starts.is_loop.any():
         verdict = judge_loops(graph, starts.is_loop, known[chosen], options, callback)
-        is_ended = verdict.solution.status != "stopped" or verdict.solution.limit == "steps"
-        if config.start == "auto" and is_ended and verdict.refuses_more_than_noise:
+        if config.start == "auto" and not verdict.solution.is_broken_off and verdict.refuses_more_than_noise:
             chosen, verdict = starts.all_together(chosen, verdict, known)
             costs[chosen] = convex_cost(problem, [known[chosen]])
         poses = verdict.poses
@@ -245,7 +244,7 @@ def optimize_pose_graph(
         (reasons if bent else notes).append(told)
     examined = time.perf_counter()
     reliability, found = None, []
-    if config.examine and (solution.status != "stopped" or solution.limit == "steps"):
+    if config.examine and not solution.is_broken_off:
         if loss is not None or config.objective == "chordal":
             found = held_against_each_other(
                 graph, poses_end, options, loss, None if starts.verdict is None else starts.verdict.is_kept

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from boxplus import InputError, PoseGraph, PoseGraphConfig, losses, optimize_pose_graph
+from boxplus import InputError, PoseGraphConfig, losses, optimize_pose_graph
 from boxplus.manifolds import se2, se3
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.simulation.pose_graphs import simulate_pose_graph, without_false_loops
 from boxplus.systems.pose_graph.loops import judge_all_together
 from boxplus.systems.pose_graph.problem import consecutive_edges, positions, with_edges
+from tests.systems.pose_graph.laps import laps
 
 GNC = PoseGraphConfig(robust="gnc")
 
@@ -54,23 +55,10 @@ def test_loops_are_judged_right_and_the_map_is_that_of_the_true_ones(dimension, 
     np.testing.assert_allclose(result.loops.innovations, result.errors, rtol=1e-9, atol=1e-9)
 
 
-def _laps(sigma_rotation: float, seed: int) -> PoseGraph:
-    """Six laps of a circle, 400 poses, every one joined to that of the lap before; turns are noisy, and nothing is false."""
-    rng = np.random.default_rng(seed)
-    angle = 2.0 * np.pi * np.arange(400) / 66.0
-    truth = np.column_stack([angle + 0.5 * np.pi, 10.0 * np.cos(angle), 10.0 * np.sin(angle)])
-    edges = np.array([[k, k + 1] for k in range(399)] + [[k - 66, k] for k in range(66, 400)])
-    sigma = np.array([sigma_rotation, 0.02, 0.02])
-    exact = se2.compose(se2.inverse(truth[edges[:, 0]]), truth[edges[:, 1]])
-    measured = SE2.boxplus(exact, sigma * rng.standard_normal((len(edges), 3)))
-    information = np.tile(np.diag(sigma**-2.0), (len(edges), 1, 1))
-    return PoseGraph(2, np.arange(400), None, edges, measured, information, np.zeros(0, dtype=np.int64))
-
-
 @pytest.mark.parametrize("seed", [4, 7, 8])
 def test_true_loops_that_odometry_alone_led_away_from_are_kept(seed):
     """What turns that err by 11 degrees a step lead to is no judge; all loop closures together are."""
-    graph = _laps(0.2, seed)
+    graph = laps(0.2, seed)
     result, known = optimize_pose_graph(graph, GNC), optimize_pose_graph(graph)
     assert result.loops.is_kept.mean() > 0.99 and result.doubt is None
     assert result.start == "chordal" and "leads too far astray" in result.start_reason

@@ -19,6 +19,7 @@ from boxplus.sparse.components import connected_components
 from boxplus.systems.pose_graph.arms import bridges_of
 from boxplus.systems.pose_graph.problem import consecutive_edges, with_edges
 from boxplus.systems.pose_graph.reliability import Reliability
+from tests.systems.pose_graph.laps import laps
 
 GNC = PoseGraphConfig(robust="gnc")
 
@@ -190,14 +191,5 @@ def test_a_single_loop_that_does_not_close_is_not_to_be_trusted_whatever_roundin
 @pytest.mark.parametrize("seed", [1, 3, 5])
 def test_a_length_that_loops_at_the_same_place_do_not_tell_is_not_told(seed):
     """Laps of which every pose comes back to that of the lap before: a scale moves no loop, but for the noise of the result."""
-    rng = np.random.default_rng(seed)
-    angle = 2.0 * np.pi * np.arange(400) / 66.0
-    truth = np.column_stack([angle + 0.5 * np.pi, 10.0 * np.cos(angle), 10.0 * np.sin(angle)])
-    edges = np.array([[k, k + 1] for k in range(399)] + [[k - 66, k] for k in range(66, 400)])
-    sigma = np.array([0.12, 0.02, 0.02])
-    exact = se2.compose(se2.inverse(truth[edges[:, 0]]), truth[edges[:, 1]])
-    measured = SE2.boxplus(exact, sigma * rng.standard_normal((len(edges), 3)))
-    information = np.tile(np.diag(sigma**-2.0), (len(edges), 1, 1))
-    graph = PoseGraph(2, np.arange(400), None, edges, measured, information, np.zeros(0, dtype=np.int64))
-    result = optimize_pose_graph(graph)
+    result = optimize_pose_graph(laps(0.12, seed))
     assert result.doubt is None and not result.notes

@@ -35,9 +35,8 @@ _CHANGED = 0.01  # of the pixels' distance from the principal point, by which th
 _MORE_STEPS = 0.2  # of the cost, which no further steps gain after as many as were allowed
 _BENT, _FALLS = 0.03, 0.6  # the same, and what is left of the cost, for a scene that is bent by more than the noise of its points
 _ROUGH_PX, _OF_START, _STEPS = 2.0, 0.5, 10  # [px] median error of a start; share of it that another lens leaves; steps
-_HALF = (
-    1.0  # of what is left, by which the cost of a BAL file has to fall, within two steps; real lenses gain a quarter to a third
-)
+# Of what is left, by which the cost of a BAL file has to fall, within two steps; real lenses gain a quarter to a third.
+_HALF = 1.0
 _RADIAL = frozenset({"k1", "k2"})
 _FEW = tuple(  # of all parts, asked whether they say as much as more of them
     frozenset(parts)
