@@ -71,6 +71,8 @@ class Content:
     scans: int = 6
     points: int = 40
     imu_rate: int = 100
+    frames: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of the messages on a topic, in turn
+    imu_burst: int = 1  # messages that arrive together, with the last of them
     accel: tuple[float, float, float] = (0.0, 0.0, 9.81)
     gyro: tuple[float, float, float] = (0.001, 0.0, 0.0)
     lidar_delay_ns: int = 102_000_000
@@ -96,6 +98,11 @@ class Content:
 
     def stamp_ns(self, index: int) -> int:
         return START_NS + index * PERIOD_NS
+
+    def frame(self, topic: str, index: int) -> str:
+        """The frame of the message of this index; a topic's own name where nothing else is said."""
+        frames = self.frames.get(topic, ({"/imu": "imu"}.get(topic, "lidar"),))
+        return frames[index % len(frames)]
 
     def written_stamp_ns(self, index: int) -> int:
         """The stamp in the message of a scan."""
@@ -158,7 +165,9 @@ def write_bag(folder: Path, container: Container, content: Content | None = None
         count = (content.scans * PERIOD_NS * content.imu_rate) // 10**9 + 1
         for index in (k for k in range(count) if content.keeps("/imu", k)):
             stamp_ns = START_NS + index * 10**9 // content.imu_rate
-            events.append((stamp_ns, "/imu", _imu_message(bag, content, stamp_ns)))
+            last = START_NS + (index // content.imu_burst + 1) * content.imu_burst * 10**9 // content.imu_rate
+            received_ns = stamp_ns if content.imu_burst == 1 else last
+            events.append((received_ns, "/imu", _imu_message(bag, content, stamp_ns, content.frame("/imu", index))))
     for offset_ns, place, status in content.fixes:
         for topic in content.fix_topics:
             stamp_ns = START_NS + offset_ns
@@ -173,7 +182,7 @@ def write_bag(folder: Path, container: Container, content: Content | None = None
 
 def cloud_message(bag: _Bag, content: Content, index: int) -> Any:
     types = bag.store.types
-    header = bag.header(content.written_stamp_ns(index), "lidar")
+    header = bag.header(content.written_stamp_ns(index), content.frame("/points", index))
     p_lidar, times_ns = content.p_lidar(index), content.times_ns(index)
     relative = times_ns - content.stamp_ns(index)
     if content.layout.startswith("livox"):
@@ -225,12 +234,12 @@ def cloud_message(bag: _Bag, content: Content, index: int) -> Any:
     )
 
 
-def _imu_message(bag: _Bag, content: Content, stamp_ns: int) -> Any:
+def _imu_message(bag: _Bag, content: Content, stamp_ns: int, frame: str) -> Any:
     types = bag.store.types
     vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
     gyro, accel = content.imu(stamp_ns)
     return types["sensor_msgs/msg/Imu"](
-        header=bag.header(stamp_ns, "imu"),
+        header=bag.header(stamp_ns, frame),
         orientation=quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
         orientation_covariance=np.zeros(9),
         angular_velocity=vector(*gyro),

@@ -46,6 +46,7 @@ class CameraBag:
     distortion: str = "plumb_bob"
     D: tuple[float, ...] = D
     transforms: bool = True
+    moved_again: bool = False  # one more transform of the last camera, half a metre from the first
     padding: int = 3
     compressed: str = ""
     R: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -77,9 +78,11 @@ class CameraBag:
                 events.append((received_ns, topic, self._image(bag, topic, camera, index)))
         if self.imu:
             for stamp_ns in range(START_NS - 4 * IMU_NS, START_NS + self.frames * FRAME_NS, IMU_NS):
-                events.append((stamp_ns, "/imu", _imu_message(bag, Content(), stamp_ns)))
+                events.append((stamp_ns, "/imu", _imu_message(bag, Content(), stamp_ns, "imu")))
         if self.transforms:
             content = Content(transforms=[("imu", f"cam{k}", _values(k)) for k in range(len(self.topics))])
+            if self.moved_again:
+                content.transforms.append(("imu", content.transforms[-1][1], content.transforms[-1][2] + np.eye(7)[0] / 2))
             events.append((START_NS, "/tf_static", _transform_message(bag, content)))
         with bag.writer:
             for received_ns, topic, message in sorted(events, key=lambda event: event[0]):

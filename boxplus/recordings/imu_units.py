@@ -4,6 +4,9 @@ The accelerometer at rest, or in the median of any motion a robot survives, show
 The gyroscope is in rad/s, as its message defines (sensor_msgs/Imu and REP 103), unless its rates are beyond any gyroscope.
 Nothing that depends on the motion may overrule the definition: a multirotor's specific force, for one, does not turn with its
 body. Whether the definition holds, the LiDAR's rotation tells (docs/agreement.md).
+
+Some drivers deliver what is left without gravity. Of a lively motion that has a median of about 1 m/s², which looks like 1 g; but
+it is next to nothing ever again, which an accelerometer shows in free fall only.
 """
 
 from __future__ import annotations
@@ -20,6 +23,9 @@ ACCEL_SCALE: dict[AccelUnit, float] = {"m/s2": 1.0, "g": STANDARD_GRAVITY}
 GYRO_SCALE: dict[GyroUnit, float] = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 
 _PLAUSIBLE_NORMS: dict[AccelUnit, tuple[float, float]] = {"g": (0.6, 1.6), "m/s2": (6.0, 16.0)}
+_WEIGHTLESS = 0.52
+"""Of the median: a tenth of the samples below it is free fall. In walks, drives and flights that tenth is below 0.67 and more,
+shaken by 5 m/s² rms along every axis below 0.55; without gravity below 0.1 in walks and drives, 0.5 where it is noise alone."""
 _FASTEST_RAD_S = 35.0
 """2000 °/s, the range of the fastest common gyroscopes."""
 
@@ -29,7 +35,7 @@ def read_accel_unit(accel: NDArray[np.float64], options: RecordingOptions) -> tu
 
     Raises:
         RecordingError: no finite sample.
-        AmbiguityError: the norm is neither one gravity in g nor in m/s².
+        AmbiguityError: the norm is neither one gravity in g nor in m/s², or is about 1 and gravity seems to be missing.
     """
     norms = _norms(accel)
     if not len(norms):
@@ -47,6 +53,15 @@ def read_accel_unit(accel: NDArray[np.float64], options: RecordingOptions) -> tu
             "a median |acceleration| of about 1 (g) or 9.8 (m/s2)",
             f"{norm:.4g} over {len(norms)} samples",
             "say the unit with --accel-unit; if it already is m/s2 or g, gravity is missing from the data and boxplus needs it",
+        )
+    least = float(np.quantile(norms, 0.1))
+    if fitting[0] == "g" and least < _WEIGHTLESS * norm:
+        raise AmbiguityError(
+            "accelerations with gravity in them, which never come near zero but in free fall",
+            f"a median |acceleration| of {norm:.3f}, as of an accelerometer in g, and a tenth of the samples below {least:.3f}, "
+            "as of one in m/s2 without gravity",
+            "let the driver deliver what the accelerometer measures, gravity included (boxplus needs it); if it really is in g "
+            "say so with --accel-unit g",
         )
     return fitting[0], Evidence("accel_unit", fitting[0], "ok", f"median |acceleration| is {norm:.3f} over {len(norms)} samples")
 

@@ -55,7 +55,7 @@ def _placed(container: Container, info: RecordingInfo, found: RecordingInfo, oth
     """Where the LiDAR lies and how its clock goes, with the evidence."""
     key, first = f"T_lidar_other of {other.topic}", info.lidar_topic
     if other.T_lidar_other is not None:
-        T, source = np.array(other.T_lidar_other), "given"
+        T, source, disagreement = np.array(other.T_lidar_other), "given", ""
     else:
         same = info.lidar_frame == found.lidar_frame
         chained = None if same else static_chain(container, [], info.lidar_frame, found.lidar_frame)
@@ -67,10 +67,11 @@ def _placed(container: Container, info: RecordingInfo, found: RecordingInfo, oth
                 f"{what} {names}",
                 f"give it: --other-lidars '{{topic: {other.topic}, T_lidar_other: [[…], …]}}' (docs/several_lidars.md)",
             )
-        T, source = chained[0], f"static transforms {' ← '.join(chained[1])}"
-    info.evidence.append(
-        Evidence(key, "given" if source == "given" else "static transforms", "ok", f"{source}; held while running")
-    )
+        T, disagreement = chained.T_target_source, chained.disagreement
+        source = f"static transforms {' ← '.join(chained.way)}"
+    text = f"{source}; held while running" + (f"; {disagreement}: give T_lidar_other" if disagreement else "")
+    how = "given" if source == "given" else "static transforms"
+    info.evidence.append(Evidence(key, how, "warning" if disagreement else "ok", text))
     apart = found.stamp_delay_s - other.time_offset_s - info.stamp_delay_s
     text = f"clouds of {other.topic} arrive {apart:+.3f} s after their stamps, compared with those of {first}"
     if abs(apart) >= _APART_S:

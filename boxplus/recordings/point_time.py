@@ -21,29 +21,55 @@ UNIT_NS: dict[TimeUnit, int] = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000
 _SHORTEST_SPAN, _LONGEST_SPAN = 0.05, 1.5
 """A scan's times span this fraction of the scan period: a sector of a turn up to a scan that overlaps the next one."""
 _LIKELY_PERIODS_S = (0.02, 0.5)
+_FEWEST_POINTS = 100  # of a cloud, to tell that too many share a time
 _FARTHEST_FROM_STAMP_NS = 10_000_000_000
 _SAME_CLOCK_NS = 1_000_000_000
 _STAMPED = 1e-3  # of a scan's duration: received with its stamp, as far as a recorder tells them apart
 _A_SCAN = (0.9, 1.9)  # scans' durations after the stamp at which a message arrives whose stamp is the start
 _EARLY_NS = 10_000_000  # that an IMU message may take longer than a scan to arrive
+_AT_ONCE = 0.15  # of the points of a scan: no LiDAR that sweeps measures as many at one instant, of 16 columns each has 0.06
 
 
 @dataclass(frozen=True, slots=True)
 class CloudTimes:
-    """What detection needs of one cloud: its stamp, when it was received, and the extent of its time values (raw unit)."""
+    """What detection needs of one cloud: its stamp, when it was received, and its time values (raw unit).
+
+    Attributes:
+        stamp_ns, received_ns: of its message.
+        low, high: their extent.
+        at_once: share of the points with the commonest of them; 0 where that is not known.
+        commonest: it.
+    """
 
     stamp_ns: int
     received_ns: int
     low: float | int
     high: float | int
+    at_once: float = 0.0
+    commonest: float | int = 0
 
 
-def times_of_cloud(stamp_ns: int, received_ns: int, values: NDArray[np.generic]) -> CloudTimes | None:
-    """The extent of the time values (N,) of one cloud, or None when no value is finite."""
-    finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+def times_of_cloud(
+    stamp_ns: int, received_ns: int, values: NDArray[np.generic], measured: NDArray[np.bool_] | None = None
+) -> CloudTimes | None:
+    """The time values (N,) of one cloud, or None when no value is finite.
+
+    Args:
+        stamp_ns, received_ns: of its message.
+        values: as recorded.
+        measured: (N,) which of them belong to a point that was measured: drivers leave 0 where there was none. None: all.
+    """
+    usable = np.isfinite(values) if values.dtype.kind == "f" else np.ones(len(values), bool)
+    finite = values[usable]
     if not len(finite):
         return None
-    return CloudTimes(stamp_ns, received_ns, finite.min().item(), finite.max().item())
+    low, high = finite.min().item(), finite.max().item()
+    of_points = finite if measured is None else values[usable & measured]
+    if len(of_points) < _FEWEST_POINTS:
+        return CloudTimes(stamp_ns, received_ns, low, high)
+    different, count = np.unique(of_points, return_counts=True)
+    most = int(count.argmax())
+    return CloudTimes(stamp_ns, received_ns, low, high, float(count[most] / len(of_points)), different[most].item())
 
 
 def choose_time_field(fields: tuple[str, ...], candidates: tuple[str, ...], options: RecordingOptions) -> str | None:
@@ -112,7 +138,21 @@ def read_point_time(
     reference, anchor, text = _read_reference(field, clouds, unit, period, imu_delay_ns, options)
     doubt = _doubt(clouds, UNIT_NS[unit], imu_delay_ns) if options.point_time_reference == "scan_end" and anchor == "last" else ""
     evidence = Evidence("point_time_reference", reference, "warning" if doubt else "ok", text + doubt)
-    return PointTimeReading(field, unit, reference, anchor), [unit_evidence, evidence]
+    return PointTimeReading(field, unit, reference, anchor), [unit_evidence, evidence, *_shared_times(field, clouds)]
+
+
+def _shared_times(field: str, clouds: list[CloudTimes]) -> list[Evidence]:
+    """That many points bear one and the same time: some were never given one, or their times are rounded."""
+    at_once = float(np.median([cloud.at_once for cloud in clouds]))
+    if at_once < _AT_ONCE:
+        return []
+    usual = min(clouds, key=lambda cloud: abs(cloud.at_once - at_once))
+    text = (
+        f"{at_once * 100:.0f} % of a scan's points bear one and the same time in the field {field} (such as "
+        f"{usual.commonest:.12g}): the driver left it out for some of them, or a type with too few digits has rounded it; motion "
+        "within a scan is corrected wrongly: mend the driver, or choose another --point-time-field"
+    )
+    return [Evidence("point_times", f"{at_once * 100:.0f} % at once", "warning", text)]
 
 
 def _read_unit(

@@ -69,3 +69,14 @@ def test_values_that_are_no_numbers() -> None:
     with pytest.raises(RecordingError, match="finite accelerations"):
         read_accel_unit(nothing, FREE)
     assert read_gyro_unit(nothing, FREE)[0] == "rad/s"
+
+
+@given(seed=st.integers(0, 1000), size=st.floats(0.65, 1.55))
+def test_accelerations_without_gravity_are_not_taken_for_those_in_g(seed: int, size: float) -> None:
+    accel = np.random.default_rng(seed).normal(size=(600, 3)) * [1.0, 0.4, 0.1]
+    accel *= size / np.median(np.linalg.norm(accel, axis=1))
+    with pytest.raises(AmbiguityError, match=r"gravity in them.*without gravity – .*gravity included.*--accel-unit g"):
+        read_accel_unit(accel, FREE)
+    assert read_accel_unit(accel, RecordingOptions(accel_unit="g"))[0] == "g"
+    # Shaken as hard, but with gravity.
+    assert read_accel_unit(0.4 * accel / size + [0.0, 0.0, 1.0], FREE)[0] == "g"

@@ -143,3 +143,26 @@ def test_fields() -> None:
         choose_time_field(("t", "time"), ("t", "time"), free)
     with pytest.raises(RecordingError, match="the point time field 'u' – got a cloud with the fields x, t"):
         choose_time_field(("x", "t"), ("t",), RecordingOptions(point_time_field="u"))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.6])
+def test_points_that_share_a_time_are_told(share: float) -> None:
+    """Left out for some of the points; points that were not measured bear any time."""
+    values = np.linspace(0.0, 0.1, 1000)
+    values[np.random.default_rng(0).random(1000) < share] = 0.0
+    padded, measured = np.concatenate([values, np.zeros(2000)]), np.arange(3000) < 1000
+    stamps = [START_NS + k * 100_000_000 for k in range(6)]
+    clouds = [times_of_cloud(stamp, stamp + 102_000_000, padded, measured) for stamp in stamps]
+    _, evidence = read_point_time("time", clouds, 0.0, RecordingOptions())
+    told = [entry for entry in evidence if entry.key == "point_times"]
+    assert bool(told) == (share > 0.2)
+    assert all(entry.verdict == "warning" and "one and the same time" in entry.text for entry in told)
+
+
+def test_times_rounded_to_a_few_values_are_told_and_columns_are_not() -> None:
+    stamps = [START_NS + k * 100_000_000 for k in range(6)]
+    for step_s, said in ((0.03125, True), (0.1 / 16, False)):
+        values = np.floor(np.linspace(0.0, 0.0999, 1000) / step_s) * step_s
+        clouds = [times_of_cloud(stamp, stamp + 102_000_000, values) for stamp in stamps]
+        _, evidence = read_point_time("time", clouds, 0.0, RecordingOptions())
+        assert ("point_times" in {entry.key for entry in evidence}) == said

@@ -57,9 +57,12 @@ def antenna_of(
     if found is None:
         text = f"no static transforms from {imu_frame!r} to the antenna's frame {frame!r}: 'boxplus slam' has --gnss-lever-arm"
         return None, Evidence(key, "unknown", "warning", text)
-    T, way = found
+    T, way, disagreement = found
     value = ", ".join(f"{x:.3f}" for x in T[:3, 3])
-    return T[:3, 3].copy(), Evidence(key, f"{value} m", "ok", f"in the IMU frame, by static transforms {' ← '.join(way)}")
+    text = f"in the IMU frame, by static transforms {' ← '.join(way)}"
+    if disagreement:
+        return T[:3, 3].copy(), Evidence(key, f"{value} m", "warning", f"{text}; {disagreement}: check --gnss-lever-arm")
+    return T[:3, 3].copy(), Evidence(key, f"{value} m", "ok", text)
 
 
 def bag_fixes(container: Container, topic: str, start_ns: int, stop_ns: int) -> GnssFixes:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from boxplus.errors import AmbiguityError, RecordingError
 from boxplus.recordings import point_time
-from boxplus.recordings.bags.clouds import cloud_layout, view_points
+from boxplus.recordings.bags.clouds import cloud_layout, coordinates, view_points
 from boxplus.recordings.bags.container import Channel, Container, interval, share
 from boxplus.recordings.bags.gnss import antenna_of, choose_gnss
 from boxplus.recordings.bags.messages import (
@@ -20,7 +21,7 @@ from boxplus.recordings.bags.messages import (
     parse_point_cloud,
     parse_transforms,
 )
-from boxplus.recordings.bags.transforms import Transform, chain
+from boxplus.recordings.bags.transforms import Chain, Transform, chain
 from boxplus.recordings.imu_units import read_accel_unit, read_gyro_unit
 from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic, no_imu
 from boxplus.recordings.options import NO_IMU, AccelUnit, GyroUnit, RecordingOptions, check_start
@@ -37,6 +38,8 @@ _PROBE_NS = 6_000_000_000
 _PROBE_SCANS = 30
 _SAME_CLOCK_S = 2.0
 _MOST_TRANSFORM_MESSAGES = 1000
+_MOST_RENAMINGS = 2  # of a topic's frame
+_QUICKEST = 0.05  # of the IMU's messages: where they arrive many at a time, all but the last have waited for it
 
 
 @dataclass(slots=True)
@@ -48,9 +51,13 @@ class _CloudProbe:
     times: list[point_time.CloudTimes] = field(default_factory=list)
     stamp_ns: list[int] = field(default_factory=list)
     received_ns: list[int] = field(default_factory=list)
-    frame: str = ""
+    frames: list[str] = field(default_factory=list)
     seen: int = 0
     complaint: str = ""
+
+    @property
+    def frame(self) -> str:
+        return self.frames[-1] if self.frames else ""
 
 
 @dataclass(slots=True)
@@ -61,7 +68,11 @@ class _ImuProbe:
     received_ns: list[int] = field(default_factory=list)
     gyro: list[tuple[float, ...]] = field(default_factory=list)
     accel: list[tuple[float, ...]] = field(default_factory=list)
-    frame: str = ""
+    frames: list[str] = field(default_factory=list)
+
+    @property
+    def frame(self) -> str:
+        return self.frames[-1] if self.frames else ""
 
 
 def find_out(path: Path, container: Container, options: RecordingOptions) -> RecordingInfo:
@@ -85,14 +96,16 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
             f"none that can be read in the first seconds{f' ({probe.complaint})' if probe.complaint else ''}",
             "choose another --lidar-topic or convert the recording to sensor_msgs/PointCloud2",
         )
-    lidar_delay = _delay_ns(lidar.topic, probe.stamp_ns, probe.received_ns)
+    _check_frames(lidar.topic, probe.frames)
+    lidar_delay = _delay_ns(lidar.topic, probe.stamp_ns, probe.received_ns, 0.5)
     delay: float | None = None
     if imu is not None:
         if not imu_probe.time_ns:
             raise RecordingError(
                 f"IMU messages on {imu.topic}", "none that can be read in the first seconds", "choose another --imu-topic"
             )
-        delay = _delay_ns(imu.topic, imu_probe.time_ns, imu_probe.received_ns)
+        _check_frames(imu.topic, imu_probe.frames)
+        delay = _delay_ns(imu.topic, imu_probe.time_ns, imu_probe.received_ns, _QUICKEST)
         evidence.append(_clocks(lidar_delay - delay))
     reading = PointTimeReading(None, "ns", "scan_start", "stamp")
     name = point_time.choose_time_field(probe.fields, probe.time_fields, options)
@@ -141,15 +154,25 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
     )
 
 
-def _delay_ns(topic: str, stamp_ns: list[int], received_ns: list[int]) -> float:
-    """Median time from stamp to reception. Raises RecordingError when the stamps stand still."""
+def _check_frames(topic: str, frames: list[str]) -> None:
+    """Raise RecordingError when the messages are those of several sensors in turn; a frame may get another name once."""
+    if sum(before != after for before, after in pairwise(frames)) > _MOST_RENAMINGS:
+        raise RecordingError(
+            f"the messages of one sensor on {topic}",
+            f"those of several in turn, in the frames {', '.join(map(repr, dict.fromkeys(frames)))}",
+            "record every sensor on a topic of its own, or take those of the others out of the recording",
+        )
+
+
+def _delay_ns(topic: str, stamp_ns: list[int], received_ns: list[int], quantile: float) -> float:
+    """Time from stamp to reception, that quantile of it. Raises RecordingError when the stamps stand still."""
     if len(stamp_ns) >= 3 and min(stamp_ns) == max(stamp_ns):
         raise RecordingError(
             f"stamps on {topic} that go on from message to message",
             f"the same stamp {stamp_ns[0] * 1e-9:.3f} s on the first {len(stamp_ns)} messages",
             "let the driver fill in header.stamp; the times of reception are too rough to replace it",
         )
-    return float(np.median(np.array(received_ns, np.float64) - np.array(stamp_ns, np.float64)))
+    return float(np.quantile(np.array(received_ns, np.int64) - np.array(stamp_ns, np.int64), quantile))
 
 
 def _clocks(difference_ns: float) -> Evidence:
@@ -250,7 +273,7 @@ def _probe(
                 samples.received_ns.append(received_ns)
                 samples.gyro.append(gyro)
                 samples.accel.append(accel)
-                samples.frame = frame
+                samples.frames.append(frame)
             elif probes[channel.topic].seen < _PROBE_SCANS:
                 _probe_cloud(probes[channel.topic], CLOUD_PARSERS[channel.type](data, channel.encoding), received_ns, options)
         except MalformedMessageError as error:
@@ -263,21 +286,22 @@ def _probe_cloud(probe: _CloudProbe, cloud: CloudMessage, received_ns: int, opti
     layout = cloud_layout(cloud.fields, cloud.big_endian, cloud.point_step, None)
     probe.fields = tuple(field.name for field in cloud.fields)
     probe.time_fields = layout.time_fields
-    probe.frame = cloud.frame
+    probe.frames.append(cloud.frame)
     probe.stamp_ns.append(cloud.stamp_ns)
     probe.received_ns.append(received_ns)
     probe.seen += 1
     name = options.point_time_field or (layout.time_fields[0] if len(layout.time_fields) == 1 else None)
     if name in probe.fields:
-        times = point_time.times_of_cloud(cloud.stamp_ns, received_ns, view_points(cloud, name)["time"])
+        points = view_points(cloud, name)
+        p_lidar = coordinates(points)
+        measured = np.logical_and(np.isfinite(p_lidar).all(axis=1), p_lidar.any(axis=1))
+        times = point_time.times_of_cloud(cloud.stamp_ns, received_ns, points["time"], measured)
         if times is not None:
             probe.times.append(times)
 
 
-def static_chain(
-    container: Container, transforms: list[Transform], target: str, source: str
-) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float64]], list[str]] | None:
-    """T_target_source (4, 4) from the static transforms, those known first, and the frames on the way; None: not connected."""
+def static_chain(container: Container, transforms: list[Transform], target: str, source: str) -> Chain | None:
+    """The transform between two frames from the static transforms, those known first; None: not connected."""
     found = chain(transforms, target, source)
     topics = frozenset(
         c.topic for c in container.channels if c.type in TRANSFORM_TYPES and c.topic.endswith("tf_static") and c.count
@@ -314,6 +338,10 @@ def _extrinsic(
             "",
             Evidence(key, "unknown", "warning", f"{what}: give --T-imu-lidar, or the rotation is estimated from the data"),
         )
-    T_imu_lidar, way = found
+    T_imu_lidar, way, disagreement = found
     source = f"static transforms {' ← '.join(way)}"
-    return T_imu_lidar, source, Evidence(key, "static transforms", "ok", f"LiDAR pose in the IMU frame from the {source}")
+    text = f"LiDAR pose in the IMU frame from the {source}"
+    if disagreement:
+        advice = "record one of them only, or say which holds with --T-imu-lidar"
+        return T_imu_lidar, source, Evidence(key, "static transforms", "warning", f"{text}; {disagreement}: {advice}")
+    return T_imu_lidar, source, Evidence(key, "static transforms", "ok", text)

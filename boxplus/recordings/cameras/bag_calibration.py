@@ -92,13 +92,14 @@ def stated_in_bag(
         model, why = _model(info, rectified)
         if model is None:
             missing["model"] = f"{info_topic}: {why}"
-    T_body_camera, mounting_source = None, ""
+    T_body_camera, mounting_source, mounting_doubt = None, "", ""
     if is_body:
         T_body_camera, mounting_source = np.eye(4), THIS_IS_THE_BODY
     elif frame == body_frame:
         missing["T_body_camera"] = f"{plain} and the body both name the frame {frame!r}, which says nothing about the mounting"
     elif (connected := chain(transforms, body_frame, frame)) is not None:
-        T_body_camera, mounting_source = connected[0], f"static transforms {' ← '.join(connected[1])}"
+        T_body_camera, mounting_doubt = connected.T_target_source, connected.disagreement
+        mounting_source = f"static transforms {' ← '.join(connected.way)}"
     else:
         what = "do not connect" if transforms else "are not in the recording, which would have to connect"
         missing["T_body_camera"] = f"static transforms {what} {body_frame!r} and {frame!r}"
@@ -107,7 +108,7 @@ def stated_in_bag(
         if T_body_camera is None:
             missing["T_body_camera"] = f"the images are rectified, and {info_topic} does not say by which rotation R"
     size = None if info is None else (info.width, info.height)
-    return StatedCamera(info_topic, model, size, T_body_camera, None, topic, mounting_source, missing)
+    return StatedCamera(info_topic, model, size, T_body_camera, None, topic, mounting_source, missing, mounting_doubt=mounting_doubt)
 
 
 def _model(info: InfoMessage, rectified: bool) -> tuple[CameraModel | None, str]:

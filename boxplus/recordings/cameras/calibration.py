@@ -44,6 +44,7 @@ class StatedCamera:
         mounting_source: where `T_body_camera` comes from, if not from `source`.
         missing: why something is None.
         line_delay_s: time from row to row of a rolling shutter [s].
+        mounting_doubt: what else the source says about `T_body_camera`, a sentence; empty where nothing contradicts.
     """
 
     source: str
@@ -55,6 +56,7 @@ class StatedCamera:
     mounting_source: str = ""
     missing: Mapping[str, str] = field(default_factory=dict)
     line_delay_s: float | None = None
+    mounting_doubt: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -85,6 +85,9 @@ def _resolved(index: int, camera: FoundCamera) -> tuple[CameraStream, list[Evide
         if stated.T_body_camera is not None and T_body_camera is None:
             T_body_camera = stated.T_body_camera
             sources["T_body_camera"] = stated.mounting_source or stated.source
+            if stated.mounting_doubt:
+                text = f"{sources['T_body_camera']}: {stated.mounting_doubt}; find out which belongs to this rig"
+                evidence.append(Evidence(f"{camera.name}_mounting", "contradicted", "warning", text))
         elif T_body_camera is not None and stated.T_body_camera is not None:
             turned, moved = _difference(T_body_camera, stated.T_body_camera)
             if turned > _SAME_ANGLE or moved > _SAME_PLACE:

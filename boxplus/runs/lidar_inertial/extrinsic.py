@@ -125,7 +125,8 @@ def _known_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic | Non
         return Extrinsic(np.array(config.T_imu_lidar), "given", "T_imu_lidar as given", False, "")
     if recording.info.T_imu_lidar is not None:
         text = f"T_imu_lidar from {recording.info.T_imu_lidar_source or 'the recording'}"
-        return Extrinsic(recording.info.T_imu_lidar, "recording", text, False, "")
+        doubts = [entry.text for entry in recording.info.evidence if entry.key == "T_imu_lidar" and entry.verdict != "ok"]
+        return Extrinsic(recording.info.T_imu_lidar, "recording", text, False, "; ".join(doubts))
     return None
 
 

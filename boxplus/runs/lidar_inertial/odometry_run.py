@@ -239,6 +239,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         reasons += self._odometry.time_steps
         if self._odometry.start_problem:
             reasons.append(self._odometry.start_problem)
+        reasons += [f"{entry.key}: {entry.text}" for entry in self._recording.info.evidence if entry.verdict == "error"]
         return InputError(
             "scans that IMU samples cover, and a start the filter can find",
             f"{statistics.scans_read} scans and {statistics.imu_samples_read} IMU samples, none of them usable "

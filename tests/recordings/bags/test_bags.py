@@ -255,3 +255,29 @@ def test_the_lidar_can_be_shifted_to_the_clock_of_the_imu(tmp_path: Path) -> Non
         if isinstance(one, Scan) and isinstance(other, Scan):
             assert (one.start_ns + shift, one.end_ns + shift) == (other.start_ns, other.end_ns)
             np.testing.assert_array_equal(one.p_lidar, other.p_lidar)
+
+
+def test_an_imu_whose_messages_arrive_ten_at_a_time(tmp_path: Path) -> None:
+    """All but the last of ten have waited; the LiDAR's messages have not."""
+    with open_recording(write_bag(tmp_path, "ros1", Content(scans=20, imu_burst=10))) as recording:
+        said = {evidence.key: evidence for evidence in recording.info.evidence}
+    assert said["point_time_reference"].value == "scan_start" and said["clocks"].verdict == "ok"
+
+
+def test_static_transforms_that_disagree_are_told(tmp_path: Path) -> None:
+    first = np.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
+    content = Content(transforms=[("imu", "lidar", first), ("imu", "lidar", first + np.array([0.3, 0, 0, 0, 0, 0, 0]))])
+    with open_recording(write_bag(tmp_path, "mcap", content)) as recording:
+        assert recording.info.T_imu_lidar is not None and recording.info.T_imu_lidar[0, 3] == 0.4
+        found = {e.key: e for e in recording.info.evidence}["T_imu_lidar"]
+    assert found.verdict == "warning" and "0.300 m from what the others say" in found.text and "--T-imu-lidar" in found.text
+
+
+@pytest.mark.parametrize("topic", ["/points", "/imu"])
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_sensors_that_share_a_topic_are_refused(tmp_path: Path, container: str, topic: str) -> None:
+    content = Content(scans=8, frames={topic: ("first", "second")})
+    with pytest.raises(
+        RecordingError, match=rf"one sensor on {topic} – got .* in turn, in the frames 'first', 'second' – record"
+    ):
+        open_recording(write_bag(tmp_path, container, content))

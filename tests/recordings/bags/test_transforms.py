@@ -44,3 +44,29 @@ def test_unconnected_broken_and_repeated_edges() -> None:
     moved = identity + np.array([1.0, 0, 0, 0, 0, 0, 0])
     found = chain([("a", "b", identity), ("a", "b", moved)], "a", "b")
     assert found is not None and found[0][0, 3] == 1.0
+
+
+def test_transforms_that_disagree_are_told_where_they_matter() -> None:
+    rng = np.random.default_rng(3)
+    poses = [np.concatenate((rng.normal(size=3), Rotation.random(random_state=k).as_quat())) for k in range(3)]
+    values = dict(zip("abc", poses, strict=True))
+    tree = [("base", name, values[name]) for name in "abc"]
+    T_ab = np.linalg.inv(matrix(values["a"])) @ matrix(values["b"])
+    direct = np.concatenate((T_ab[:3, 3], Rotation.from_matrix(T_ab[:3, :3]).as_quat()))
+    off = direct + np.array([0.3, 0, 0, 0, 0, 0, 0])
+    for edges, said in (
+        (tree, False),
+        ([*tree, *tree], False),
+        ([*tree, ("a", "b", direct)], False),
+        ([*tree, ("a", "b", direct + np.array([0.002, 0, 0, 0, 0, 0, 0]))], False),
+        ([*tree, ("a", "b", off)], True),
+        ([("a", "b", off), *tree], True),
+        ([*tree, ("base", "b", values["a"])], True),
+        ([*tree, ("b", "base", values["b"])], True),
+        ([*tree, ("base", "c", values["a"])], False),  # of a frame that is not on the way
+        ([*tree, ("d", "e", direct), ("d", "e", off)], False),
+    ):
+        found = chain(edges, "a", "b")
+        assert found is not None and bool(found.disagreement) == said
+    found = chain([*tree, ("a", "b", off)], "a", "b")
+    assert found is not None and "0.300 m" in found.disagreement and "0.0 deg" in found.disagreement

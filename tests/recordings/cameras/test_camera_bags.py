@@ -96,6 +96,13 @@ def test_a_given_camchain_overrules_and_its_time_offset_is_added(tmp_path: Path)
         assert images_of(recording)[0].time_ns == START_NS + 3_000_000
 
 
+def test_static_transforms_that_disagree_are_told(tmp_path: Path) -> None:
+    with open_camera_recording(CameraBag(moved_again=True).write(tmp_path)) as recording:
+        said = {evidence.key: evidence for evidence in recording.info.evidence if evidence.value == "contradicted"}
+    assert said.keys() == {"/cam1/image_raw_mounting"}
+    assert "0.500 m from what the others say; find out which" in said["/cam1/image_raw_mounting"].text
+
+
 def test_missing_calibration_is_named_and_refused(tmp_path: Path) -> None:
     bags = {
         "no CameraInfo on /cam0/camera_info": CameraBag(info=False),

@@ -22,6 +22,7 @@ from boxplus.formats.clouds.pcd import read_pcd
 from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.maps.tiles.store import TileStore
+from boxplus.recordings.info import Evidence
 from boxplus.recordings.recording import Event, Recording
 from boxplus.report import write_report
 from boxplus.runs.lidar_inertial import odometry_run
@@ -309,6 +310,24 @@ def test_view_sees_every_estimate(tmp_path: Path) -> None:
     eye = Eye()
     run_odometry(walk(2.0), tmp_path / "out", view=eye)
     np.testing.assert_array_equal(eye.times, read_trajectory(tmp_path / "out" / "trajectory.csv").times)
+
+
+def test_a_recorded_extrinsic_that_is_in_doubt_is_a_warning() -> None:
+    recording = walk(1.0)
+    config = load_run_config().odometry
+    assert choose_extrinsic(recording, config).warning == ""
+    recording.info.evidence.append(Evidence("T_imu_lidar", "static transforms", "warning", "the static transforms disagree"))
+    assert choose_extrinsic(recording, config).warning == "the static transforms disagree"
+    given = config.model_copy(update={"T_imu_lidar": tuple(map(tuple, recording.info.T_imu_lidar.tolist()))})
+    assert choose_extrinsic(recording, given).warning == ""
+
+
+def test_a_run_without_a_start_says_what_is_wrong_with_the_recording(tmp_path: Path) -> None:
+    recording = walk(1.0)
+    recording.info.evidence.append(Evidence("clocks", "differ", "error", "LiDAR and IMU are stamped by different clocks"))
+    recording.shift_lidar(-7200.0)
+    with pytest.raises(InputError, match=r"none of them usable \(.*; clocks: LiDAR and IMU are stamped by different clocks\)"):
+        run_odometry(recording, tmp_path / "out")
 
 
 @pytest.mark.slow
