@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -145,3 +145,19 @@ class Scan:
 
     def __len__(self) -> int:
         return int(self.time_ns.size)
+
+
+def in_order(scans: Iterable[Scan]) -> list[Scan]:
+    """The scans that end after all before them: what is recorded twice, or comes late, is left out.
+
+    Example:
+        >>> from boxplus.sensors.scan import in_order
+        >>> first = bp.Scan.from_arrays([[4.0, 1.0, 0.2]], [1_000_000_000])
+        >>> len(in_order([first, first, first.shifted(100_000_000)]))
+        2
+    """
+    kept: list[Scan] = []
+    for scan in scans:
+        if not kept or scan.end_ns > kept[-1].end_ns:
+            kept.append(scan)
+    return kept

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from boxplus.errors import InputError
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.scan import Scan, in_order
 
 coordinates = st.one_of(st.floats(width=32), st.just(0.0))
 
@@ -89,3 +89,11 @@ def test_the_numbers_of_lidars_stay_with_their_points() -> None:
     for wrong in ([1, 2], [0.5] * 5, [0, 1, 2, 3, 256], [-1, 0, 0, 0, 0]):
         with pytest.raises(InputError, match=r"lidar as integers of shape \(5,\)|numbers of LiDARs from 0 to 255"):
             Scan.from_arrays(points, np.arange(5), lidar=wrong)
+
+
+@given(st.lists(st.integers(0, 20), max_size=12))
+def test_scans_in_order_end_after_all_before_them(ends: list[int]) -> None:
+    scans = [Scan.from_arrays([[4.0, 1.0, 0.2]], [end]) for end in ends]
+    kept = [scan.end_ns for scan in in_order(scans)]
+    assert kept == sorted(set(kept))
+    assert kept == [end for k, end in enumerate(ends) if all(end > before for before in ends[:k])]

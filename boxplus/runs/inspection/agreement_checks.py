@@ -34,6 +34,7 @@ _KEYS: dict[Cause, tuple[str, str]] = {
     "force_sign": ("gravity_sign", "inverted"),
     "length_scale": ("length_scale", "wrong"),
     "corrected_points": ("point_times", "points corrected before"),
+    "reversed_times": ("point_times", "backwards"),
 }
 """Key and value of the evidence that a contradiction becomes."""
 _DECISIVE = {"gyro_scale", "same_platform", "points_mirrored", "point_times"}  # with these nothing else can be judged

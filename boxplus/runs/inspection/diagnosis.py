@@ -28,6 +28,7 @@ from boxplus.runs.inspection.imu_checks import check_rest, check_saturation, che
 from boxplus.runs.inspection.lidar_checks import examine_other_lidars
 from boxplus.runs.inspection.stretches import Stretch, gather_scans, lively_stretches
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import in_order
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
 from boxplus.systems.lidar_inertial_agreement.hypotheses import judges_clocks, judges_rotation
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
@@ -247,7 +248,8 @@ def _rest(stretch: Stretch, config: LioConfig) -> Rest | None:
     """What the LiDAR says about a standstill, None where its scans do not overlap."""
     if len(stretch.scans) < _FEWEST_REST_SCANS:
         return None
-    path = lidar_path(stretch.scans, config)
+    scans = in_order(stretch.scans)
+    path = lidar_path(scans, config)
     if path.failed or path.segment[-1] != path.segment[0]:
         return None
-    return judge_rest(path, stretch.scans, config)
+    return judge_rest(path, scans, config)

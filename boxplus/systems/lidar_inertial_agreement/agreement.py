@@ -24,7 +24,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.imu_values import beyond, empty, finite, glitches
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.scan import Scan, in_order
 from boxplus.systems.lidar_inertial_agreement.corrected_points import CorrectedPoints, corrected_points
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import surer_path
@@ -98,7 +98,7 @@ def compare_sensors(
     """Compare the sensors over a stretch of a recording.
 
     Args:
-        scans: consecutive sweeps, some seconds of them.
+        scans: consecutive sweeps, some seconds of them; one that is recorded twice, or comes late, is left out.
         imu: samples of the same stretch; those that are not finite are left out.
         config: of the LiDAR's noise and the sizes of cells.
         T_expected: (4, 4) T_imu_lidar that the registration may start from, a guess.
@@ -108,6 +108,8 @@ def compare_sensors(
             that disagrees with it is measured by: one that explains the scans worse is not compared with anything.
     """
     imu = usable(imu)
+    if expected is None:  # an estimator takes scans in their order only
+        scans = in_order(scans)
     found = _compare(scans, imu, with_cells_for_all(scans, config), T_expected, T_declared, refine, expected)
     if not _as_thick_as_feet(found):
         return found

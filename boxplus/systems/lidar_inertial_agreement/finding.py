@@ -18,6 +18,7 @@ Cause = Literal[
     "length_scale",
     "astray",
     "corrected_points",
+    "reversed_times",
 ]
 
 

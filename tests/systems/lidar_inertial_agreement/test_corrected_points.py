@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,4 +49,21 @@ def test_clocks_that_are_half_a_scan_apart_are_still_clocks(seed: int, offset_s:
     (None, "have been corrected already; record"),
 ])  # fmt: skip
 def test_the_finding_says_to_which_instant(instant_s: float | None, words: str) -> None:
-    assert words in CorrectedPoints(0.02, 0.04, instant_s, 0.1).finding.text
+    assert words in CorrectedPoints(0.02, 0.04, instant_s, 0.1, 0.04).finding.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 5, 9])
+def test_times_that_run_backwards_are_not_taken_for_corrected_points(seed: int) -> None:
+    simulation = handheld(seed, lidar=FINE)
+    scans, imu = data(simulation)
+    reversed_ = [replace(scan, time_ns=scan.start_ns + scan.end_ns - scan.time_ns) for scan in scans]
+    ages = [scan.shifted(scan.end_ns - scan.start_ns) for scan in reversed_]  # before a stamp at the end, read as after it
+    for spoilt in (reversed_, ages):
+        agreement = compare_sensors(spoilt, imu, CONFIG, T_declared=simulation.T_imu_lidar)
+        assert causes(agreement, simulation.T_imu_lidar) == ["reversed_times"]
+
+
+def test_the_finding_says_that_times_run_backwards() -> None:
+    found = CorrectedPoints(0.04, 0.05, 0.01, 0.1, 0.02).finding
+    assert found.cause == "reversed_times" and "to 2.0 cm, and as the times are to 5.0 cm only" in found.text

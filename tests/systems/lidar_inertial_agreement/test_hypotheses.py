@@ -268,3 +268,16 @@ def test_feet_are_named_where_little_turns_and_the_fit_turns_the_mounting_far(se
     agreement = compare_sensors(*data(simulation, faults.scale_points(FEET)), CONFIG, T_declared=T)
     assert agreement.translation is not None and np.degrees(np.linalg.norm(agreement.translation.turn)) > 15.0
     assert [finding.cause for finding in contradictions(agreement, T)] == ["length_scale"]
+
+
+def test_a_few_poses_show_no_lengths() -> None:
+    """Two seconds of a LiDAR at 5 Hz are ten poses, which fit lengths twice the right ones to millimetres."""
+    simulation = handheld(0, seconds=3.0)
+    agreement = compare_sensors(*data(simulation), CONFIG, T_declared=simulation.T_imu_lidar)
+    assert agreement.translation is not None
+    covariance = np.diag([1e-4] * 13)
+    for samples, causes in ((10, []), (20, ["length_scale"])):
+        fit = replace(agreement.translation, slope=2.15, covariance=covariance, sigma=0.004, explained=0.92, samples=samples)
+        doubtful = replace(agreement, translation=fit)
+        assert [finding.cause for finding in contradictions(doubtful, simulation.T_imu_lidar)] == causes
+        assert judges_lengths(doubtful) == bool(causes) and (slope_of(doubtful) is None) == (not causes)
