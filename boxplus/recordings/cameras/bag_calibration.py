@@ -108,7 +108,7 @@ def stated_in_bag(
         if T_body_camera is None:
             missing["T_body_camera"] = f"the images are rectified, and {info_topic} does not say by which rotation R"
     size = None if info is None else (info.width, info.height)
-    return StatedCamera(info_topic, model, size, T_body_camera, None, topic, mounting_source, missing, mounting_doubt=mounting_doubt)
+    return StatedCamera(info_topic, model, size, T_body_camera, None, topic, mounting_source, missing, None, mounting_doubt)
 
 
 def _model(info: InfoMessage, rectified: bool) -> tuple[CameraModel | None, str]:

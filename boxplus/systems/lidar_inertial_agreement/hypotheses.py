@@ -43,6 +43,7 @@ _OFFSET_OK_S = 0.014
 _SLOPE_OF_MANY_FLOOR = 0.03
 _FITS_OF_MANY = 0.7
 _FARTHEST_REVERSED = 4.5  # feet, and a third of it
+_SAME_VALUES = 1e-12  # (rad/s)², of a gyroscope's rates about their mean
 _FEWEST_POSES = 15  # compared, for lengths: of ten or eleven the errors that neighbours share are not known
 _HALF_TURN_RAD = np.deg2rad(12.0)
 _TURN_KNOWN_RAD, _TURN_OFF_RAD = np.deg2rad(3.0), np.deg2rad(6.0)
@@ -186,6 +187,12 @@ def _of_belonging(agreement: Agreement, rotation: RotationFit) -> Finding | None
     strong = max(float(np.linalg.norm(rotation.excitation)), turning)
     if strong < max(_BELONGING_RAD_S, 4.0 * rotation.sigma_registration) or rotation.together > _TOGETHER:
         return None
+    if agreement.gyro_power < _SAME_VALUES:
+        return Finding(
+            "not_together",
+            f"the LiDAR turns with {np.degrees(np.linalg.norm(rotation.excitation)):.1f} deg/s (rms), and the gyroscope gives "
+            "the same values all the time: it has failed, or its driver leaves the rates out",
+        )
     return Finding(
         "not_together",
         f"the LiDAR turns with {np.degrees(np.linalg.norm(rotation.excitation)):.1f} deg/s (rms) and the gyroscope with "

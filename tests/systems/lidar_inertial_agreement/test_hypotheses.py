@@ -110,6 +110,15 @@ def test_the_imu_of_another_platform_is_named(seed: int) -> None:
     assert [finding.cause for finding in found] == ["not_together"]
 
 
+@pytest.mark.parametrize("rate", [0.0, 0.3])
+def test_a_gyroscope_that_never_changes_is_named(rate: float) -> None:
+    simulation = handheld(0, seconds=4.0)
+    scans, imu = data(simulation)
+    agreement = compare_sensors(scans, replace(imu, gyro=np.full_like(imu.gyro, rate)), CONFIG, T_declared=simulation.T_imu_lidar)
+    found = contradictions(agreement, simulation.T_imu_lidar)
+    assert [finding.cause for finding in found] == ["not_together"] and "gives the same values all the time" in found[0].text
+
+
 @pytest.mark.slow
 def test_drifting_clocks_are_named() -> None:
     simulation = handheld(5, seconds=12.0)

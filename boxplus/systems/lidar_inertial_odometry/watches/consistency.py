@@ -130,7 +130,7 @@ class Consistency:
         self._corrected = _KEEP * self._corrected + float(corrected @ corrected)
         correction = np.zeros(TANGENT)
         boxminus_into(x, x_prior, correction)
-        warnings = self._span(frame) + self._contradicting("stuck", self._stuck.update(frame.imu))
+        warnings = self._span(frame) + self._contradicting("stuck", self._stuck.update(frame.imu, measured))
         warnings += self._innovate(frame, correction, update.cov_prior, posterior)
         warnings += self._fit(frame, fitting_share)
         warnings += self._biases(x, posterior.cov)

@@ -1,20 +1,25 @@
 """A gyroscope or accelerometer that has failed and repeats itself, while the platform moves.
 
 To the filter such a sensor is the best there is, and a platform that seems not to turn drags its map along. Values that are
-the same sample after sample are nothing by themselves: at rest, or straight on, a coarse sensor rounds its noise away. They are
-where a gyroscope stopped within a sample, as nothing that turns does, and where an accelerometer does not feel a platform that
-turns to and fro. That is said of an IMU with noise in the other sensor only: without any it is simulated.
+the same sample after sample are nothing by themselves: at rest, or straight on, a coarse sensor rounds its noise away. They
+are where a gyroscope stopped within a sample, as nothing that turns does, or where the scans turn and it does not, and where
+an accelerometer does not feel a platform that turns to and fro. That is said of an IMU with noise in the other sensor only:
+without any it is simulated.
 """
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
+from numpy.typing import NDArray
 
 from boxplus.sensors.imu import ImuSamples
 
 _STUCK_S, _FEWEST = 0.5, 10  # over which, and how many samples, all three axes repeat themselves
 _BEFORE = 4  # samples before, of a turn that lasted
 _MOST_RAD_S2 = 100.0  # by which a turn may stop: 1 rad/s within a hundredth of a second
+_WHILE_S, _TURNED_RAD = 2.0, np.deg2rad(4.0)  # which the scans turn, at 0.035 rad/s and more: no gyroscope's steps are so coarse
 _PARTS, _TO_AND_FRO_RAD_S = 5, 0.1  # parts of the time, with mean rates beyond this either way
 _GYRO, _ACCEL = slice(0, 3), slice(3, 6)
 _GYRO_NOISE, _ACCEL_NOISE = 2e-4, 2e-3  # rad/s, m/s²: second differences that no smooth motion has; real IMUs ten times
@@ -25,9 +30,15 @@ class StuckSensor:
 
     def __init__(self) -> None:
         self._time_ns, self._values = np.zeros(0, dtype=np.int64), np.zeros((0, 6))
+        self._turns: deque[tuple[int, NDArray[np.float64]]] = deque()  # since the gyroscope repeats itself, by the scans
 
-    def update(self, imu: ImuSamples) -> str | None:
-        """Take the samples of one scan in; a sentence where one of the sensors is stuck."""
+    def update(self, imu: ImuSamples, turned: NDArray[np.float64]) -> str | None:
+        """Take one scan in; a sentence where one of the sensors is stuck.
+
+        Args:
+            imu: its samples.
+            turned: (3,) rotation of the IMU over it, as the scan shows it [rad].
+        """
         new = imu.time_ns > (self._time_ns[-1] if len(self._time_ns) else np.iinfo(np.int64).min)  # scans share some
         if not new.any():
             return None
@@ -39,6 +50,8 @@ class StuckSensor:
         self._time_ns, self._values = time_ns[max(first, 0) :], values[max(first, 0) :]
         if self._stopped():
             return self._sentence("gyroscope", "and went there from a turn within one of them")
+        if self._turns_alone(imu, turned):
+            return self._sentence("gyroscope", "although the scans turn")
         return self._sentence("accelerometer", "although the platform turns to and fro") if self._feels_nothing() else None
 
     def _stopped(self) -> bool:
@@ -50,6 +63,18 @@ class StuckSensor:
         # Samples that come in bursts may bear stamps that lie much closer than they were taken.
         seconds = max(float(self._time_ns[begin] - self._time_ns[begin - 1]) * 1e-9, self._seconds_a_sample())
         return bool(steps.min() > _MOST_RAD_S2 * seconds)
+
+    def _turns_alone(self, imu: ImuSamples, turned: NDArray[np.float64]) -> bool:
+        """Whether the scans turn and turn while the gyroscope repeats itself."""
+        if self._stuck_since(_GYRO, _ACCEL, _ACCEL_NOISE) is None:
+            self._turns.clear()
+            return False
+        end_ns = int(imu.time_ns[-1])
+        self._turns.append((end_ns, turned - self._values[-1, _GYRO] * float(end_ns - imu.time_ns[0]) * 1e-9))
+        while end_ns - self._turns[0][0] > _WHILE_S * 1e9:
+            self._turns.popleft()
+        ways = np.cumsum([turn for _, turn in self._turns], axis=0)
+        return bool(np.linalg.norm(ways - ways[-1], axis=1).max() > _TURNED_RAD)
 
     def _seconds_a_sample(self) -> float:
         return float(self._time_ns[-1] - self._time_ns[0]) * 1e-9 / (len(self._time_ns) - 1)

@@ -22,16 +22,27 @@ RATE_HZ, FAILS_S = 200, 3.0
 
 
 def told(
-    gyro: np.ndarray, accel: np.ndarray, rate_hz: int = RATE_HZ, scan_s: float = 0.1, burst: int = 1
+    gyro: np.ndarray,
+    accel: np.ndarray,
+    rate_hz: int = RATE_HZ,
+    scan_s: float = 0.1,
+    burst: int = 1,
+    rates: np.ndarray | None = None,
 ) -> list[tuple[float, str]]:
-    """When [s] something was said of samples (N, 3), pushed scan by scan with one shared at every border, and what."""
+    """When [s] something was said of samples (N, 3), pushed scan by scan with one shared at every border, and what.
+
+    Args:
+        rates: (N, 3) at which the scans turn, if not as the gyroscope says [rad/s].
+    """
+    rates = gyro if rates is None else rates
     watch, said = StuckSensor(), []
     time_ns = np.arange(len(gyro)) * (1_000_000_000 // rate_hz)
     time_ns = time_ns[np.arange(len(gyro)) // burst * burst] + np.arange(len(gyro)) % burst * 50_000
     step = round(scan_s * rate_hz)
     for begin in range(0, len(gyro) - step, step):
         part = slice(begin, begin + step + 1)
-        text = watch.update(ImuSamples.from_arrays(time_ns[part], gyro[part], accel[part]))
+        turned = rates[begin : begin + step].sum(axis=0) / rate_hz
+        text = watch.update(ImuSamples.from_arrays(time_ns[part], gyro[part], accel[part]), turned)
         if text is not None:
             said.append((float(time_ns[part][-1]) * 1e-9, text))
     return said
@@ -72,6 +83,26 @@ def test_a_gyroscope_that_stops_within_a_sample_is_named_without_help_of_the_acc
     when, text = told(frozen(turning, begin_s, np.zeros(3)), rest, scan_s=scan_s)[0]
     assert begin_s + 0.5 <= when <= begin_s + 0.5 + scan_s + 0.01 and "the gyroscope" in text
     assert not told(turning, rest, scan_s=scan_s)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("value", [0.0, 0.4])
+def test_a_gyroscope_that_never_changes_is_named_where_the_scans_turn(seed: int, value: float) -> None:
+    gyro, accel = moving(seed=seed)
+    dead = np.full_like(gyro, value)
+    when, text = told(dead, accel, rates=gyro)[0]
+    assert when <= 2.0 and "the gyroscope has given the same values sample after sample, although the scans turn" in text
+    assert not told(dead, accel) and not told(gyro, accel, rates=np.zeros_like(gyro))
+
+
+@pytest.mark.parametrize("step", [0.002, 0.01, 0.02])
+@pytest.mark.parametrize("scan_s", [0.05, 0.1, 0.5])
+def test_turns_below_the_steps_of_a_coarse_gyroscope_are_nothing(step: float, scan_s: float) -> None:
+    random = np.random.default_rng(0)
+    accel = np.tile([0.0, 0.0, 9.81], (4000, 1)) + 0.02 * random.normal(size=(4000, 3))
+    slow = 0.99 * step * np.tile([0.0, 0.6, 0.8], (4000, 1))
+    noise = np.repeat(random.normal(size=(400, 3)), 10, axis=0) * np.deg2rad(0.1) / 0.05  # of the scans' turns
+    assert not told(np.zeros_like(accel), accel, scan_s=scan_s, rates=slow + noise)
 
 
 @pytest.mark.parametrize("rate_hz", [50, 100, 200, 400])
@@ -155,3 +186,17 @@ def test_a_gyroscope_that_dies_is_told_within_a_second_of_the_first_wrong_pose(m
     wrong_s = (np.array([estimate.time_ns for estimate in estimates]) - simulation.start_ns)[off] * 1e-9
     assert FAILS_S < told_s <= wrong_s.min(initial=6.0) + 1.05  # a scan more than a second
     assert odometry.contradiction is not None  # and it stays
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_gyroscope_that_gives_zeros_from_the_start_is_named(seed: int) -> None:
+    motion = trajectories.walk(((-2.5, 0.5), (1.0, 0.5), (1.0, -2.5), (-2.0, -2.0)))
+    simulation = Simulation(Scenario("dead", worlds.room(seed=seed), motion, LIDAR), seed, 8.0)
+    odometry, warnings = LidarInertialOdometry(config(simulation)), []
+    for event in dying(simulation.events(), simulation.start_ns):
+        for estimate in odometry.push_scan(event) if isinstance(event, Scan) else odometry.push_imu(event):
+            warnings += estimate.warnings
+    told = "the gyroscope has given the same values sample after sample, although the scans turn"
+    assert any(told in text for text in warnings)
+    assert odometry.contradiction is not None
