@@ -52,3 +52,15 @@ def test_a_long_plateau_is_told_at_once() -> None:
     z = vibration([2.0, 6.0], limit=5.5)
     assert np.count_nonzero(z == -5.5) >= 6
     assert len(told(z)) == 1
+
+
+@pytest.mark.parametrize("step", [0.001, 0.01, 0.03])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_steady_turn_in_coarse_steps_is_no_limit(step: float, seed: int) -> None:
+    """A vehicle whose accelerometer has less noise than a step: plateaus as long as the turn, and again in the next one."""
+    random, time = np.random.default_rng(seed), np.arange(1200) * 0.005
+    pull = 2.7 * np.clip(1.5 * np.sin(2.0 * np.pi * time / random.uniform(2.0, 6.0)), 0.0, 1.0)
+    smooth = np.convolve(np.pad(pull, 40, mode="edge"), np.hanning(81) / np.hanning(81).sum(), "valid")
+    z = np.round((smooth + 0.1 * step * random.normal(size=1200)) / step) * step
+    assert np.count_nonzero(z == z.max()) > 20
+    assert not told(z)
