@@ -24,7 +24,7 @@ from scipy.sparse import csc_matrix, tril
 from scipy.spatial import cKDTree
 
 from boxplus.formats.graphs.g2o import read_g2o
-from boxplus.sparse.ordering import order
+from boxplus.sparse.orderings.ordering import order
 
 Edges = NDArray[np.int64]
 SIZE = 6

@@ -93,7 +93,7 @@ class _Commands(TyperGroup):
         name, command, rest = super().resolve_command(ctx, args)
         if name is None or command is None:
             return name, command, rest
-        from boxplus.cli.help import Command
+        from boxplus.cli.terminal.help import Command
 
         module, _, attribute = _COMMANDS[name][0].partition(":")
         found = getattr(importlib.import_module(module), attribute)

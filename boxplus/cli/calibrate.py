@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from boxplus.cli.cameras.calibrate_cameras import cameras
-from boxplus.cli.help import Command
 from boxplus.cli.model_options import takes_recording_options
 from boxplus.cli.options import RESULTS, JsonOption, QuietOption, RecordingArgument
+from boxplus.cli.terminal.help import Command
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
-    from boxplus.cli.terminal import Terminal
+    from boxplus.cli.terminal.terminal import Terminal
     from boxplus.runs.calibration import Quantity
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, no_args_is_help=True)
@@ -49,8 +49,8 @@ def lidar_imu(
 
     Exit code 1 when the motion does not determine the mounting: the file then holds the rest and says what motion would.
     """
-    from boxplus.cli.outcome import reported
-    from boxplus.cli.terminal import Terminal
+    from boxplus.cli.terminal.outcome import reported
+    from boxplus.cli.terminal.terminal import Terminal
     from boxplus.errors import InputError
     from boxplus.recordings import open_recording
     from boxplus.runs.calibration import calibrate_lidar_imu, calibration_facts, calibration_yaml

@@ -27,7 +27,7 @@ def demo(
 
     from boxplus.cli.lidar.lio import run
     from boxplus.cli.options import without_report
-    from boxplus.cli.outcome import reported
+    from boxplus.cli.terminal.outcome import reported
     from boxplus.evaluation.evaluation import evaluate
     from boxplus.formats.trajectory import read_trajectory
     from boxplus.runs.lidar_inertial.config import load_run_config
@@ -60,7 +60,7 @@ def demo(
 
 def _provide(simulation: Simulation, recording: Path) -> None:
     """Write the recording, unless the same one is already there."""
-    from boxplus.cli.console import make_console
+    from boxplus.cli.terminal.console import make_console
     from boxplus.simulation.recording_writer import write_recording
 
     parameters = Path(f"{recording}.json")  # written last

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from boxplus.cli.own_words import EVALUATION, evaluation_in_options, saying
+from boxplus.cli.terminal.own_words import EVALUATION, evaluation_in_options, saying
 from boxplus.errors import InputError
 
 if TYPE_CHECKING:

@@ -60,7 +60,7 @@ def compare_with(truth: Trajectory, estimate: Path, evaluation: Path, alignment:
         evaluation: the file to write.
         alignment: of the estimate onto the ground truth: what the estimator leaves open.
     """
-    from boxplus.cli.own_words import EVALUATION, evaluation_in_options, in_options
+    from boxplus.cli.terminal.own_words import EVALUATION, evaluation_in_options, in_options
     from boxplus.evaluation.alignment import UndeterminedAlignmentError
     from boxplus.evaluation.evaluation import evaluate
     from boxplus.formats.output import atomic_file

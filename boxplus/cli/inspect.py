@@ -52,7 +52,7 @@ def inspect(
     """
     from rich.progress import Progress
 
-    from boxplus.cli.console import make_console
+    from boxplus.cli.terminal.console import make_console
     from boxplus.errors import RecordingError
     from boxplus.runs.inspection.diagnosis import diagnose
     from boxplus.runs.transform import parse_transform
@@ -94,7 +94,7 @@ def _print_table(diagnosis: Diagnosis) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from boxplus.cli.console import make_console
+    from boxplus.cli.terminal.console import make_console
     from boxplus.errors import printable
 
     console = make_console()

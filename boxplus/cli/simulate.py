@@ -98,7 +98,7 @@ class _Progress:
     def __init__(self, name: str) -> None:
         from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-        from boxplus.cli.console import make_console
+        from boxplus.cli.terminal.console import make_console
 
         columns = (TextColumn(name), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
         console = make_console()

@@ -19,7 +19,7 @@ def warmup() -> None:
     from concurrent.futures import ThreadPoolExecutor, as_completed
 
     from boxplus._kernel_cache import cache_root
-    from boxplus.cli.console import make_console
+    from boxplus.cli.terminal.console import make_console
     from boxplus.errors import BoxplusError
 
     console = make_console()

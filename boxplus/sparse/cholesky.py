@@ -11,7 +11,7 @@ from boxplus.errors import BoxplusError, InputError
 from boxplus.sparse.block_matrix import BlockPattern
 from boxplus.sparse.inverse_blocks import SelectedInverse, locate_blocks, split_blocks
 from boxplus.sparse.numeric_factor import NumericFactor
-from boxplus.sparse.ordering import Method, order
+from boxplus.sparse.orderings.ordering import Method, order
 from boxplus.sparse.supernodes import Fronts, lay_out
 from boxplus.sparse.triangular_solve import solve_many, solve_one
 

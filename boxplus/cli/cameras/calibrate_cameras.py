@@ -14,7 +14,7 @@ import typer
 from boxplus.cli.options import RESULTS, JsonOption, NoReportOption, OverwriteOption, QuietOption
 
 if TYPE_CHECKING:
-    from boxplus.cli.terminal import Terminal
+    from boxplus.cli.terminal.terminal import Terminal
     from boxplus.runs.camera_calibration.summary import CalibrationSummary
 
 
@@ -71,8 +71,8 @@ def cameras(
     done, 1 the views do not determine a lens (no camchain is written), 2 bad input, 3 done but not to be trusted.
     """
     from boxplus.cli.optimization.terminal import versions
-    from boxplus.cli.outcome import reported
-    from boxplus.cli.terminal import Terminal
+    from boxplus.cli.terminal.outcome import reported
+    from boxplus.cli.terminal.terminal import Terminal
     from boxplus.errors import InputError
     from boxplus.formats.output import atomic_file
     from boxplus.recordings.cameras.calibration import read_camchain

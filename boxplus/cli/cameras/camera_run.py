@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 if TYPE_CHECKING:
-    from boxplus.cli.outcome import Outcome
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.outcome import Outcome
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.evaluation.alignment import AlignmentKind
     from boxplus.recordings.cameras.events import CameraRecording
     from boxplus.recordings.cameras.options import CameraRecordingOptions
@@ -63,7 +63,7 @@ def run_cameras(
         BoxplusError: bad input, or results that cannot be written.
     """
     from boxplus.cli.ground_truth import compare_with, read_ground_truth
-    from boxplus.cli.interrupt import stop_on_interrupt
+    from boxplus.cli.terminal.interrupt import stop_on_interrupt
     from boxplus.recordings.cameras.open import open_camera_recording
     from boxplus.runs.cameras.folder import claim_camera_folder
 
@@ -92,7 +92,7 @@ def run_cameras(
 
 def timing_rows(timing: FrameTiming) -> list[tuple[str, str]]:
     """How long it took."""
-    from boxplus.cli.run_terminal import speed_text
+    from boxplus.cli.terminal.run_terminal import speed_text
 
     rows = []
     if timing.frame_ms is not None:

@@ -21,7 +21,7 @@ from boxplus.cli.options import (
     QuietOption,
     ResumeOption,
 )
-from boxplus.cli.viewing import ViewOption, viewing
+from boxplus.cli.terminal.viewing import ViewOption, viewing
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 
 if TYPE_CHECKING:
@@ -63,8 +63,8 @@ def vio(
     interrupted (results up to there are complete).
     """
     from boxplus.cli.cameras.camera_run import run_cameras
-    from boxplus.cli.outcome import reported
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.outcome import reported
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.recordings.cameras.open import has_no_imu
     from boxplus.runs.cameras.folder import VioFolder
     from boxplus.runs.settings_file import load_settings

@@ -63,8 +63,8 @@ def vo(
     interrupted (results up to there are complete).
     """
     from boxplus.cli.cameras.camera_run import run_cameras
-    from boxplus.cli.outcome import reported
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.outcome import reported
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.runs.cameras.folder import DirectFolder
     from boxplus.runs.direct.config import DirectRunConfig
     from boxplus.runs.direct.direct_run import run_direct_odometry

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.help import Command
 from boxplus.cli.options import RESULTS, SETTINGS, ConfigOption, JsonOption, QuietOption, SettingsOption
+from boxplus.cli.terminal.help import Command
 
 if TYPE_CHECKING:
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.runs.fleet.status import FleetStatus, RecordingStatus
 
 _HEADINGS = ("recording", "came out", "scans", "path length", "loops", "in the joint map")
@@ -76,8 +76,8 @@ def run_command(
     other or are joined in doubt only, no two of them met, or something speaks against their joint map, which then takes the place
     of no sound one that is there), 130 interrupted.
     """
-    from boxplus.cli.outcome import reported
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.outcome import reported
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.runs.fleet.executor import RayExecutor
     from boxplus.runs.fleet.fleet_run import run_fleet
     from boxplus.runs.fleet.recordings import find_recordings

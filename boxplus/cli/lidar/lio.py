@@ -29,14 +29,14 @@ from boxplus.cli.options import (
     lidar_settings,
     scan_settings,
 )
-from boxplus.cli.viewing import ViewOption, viewing
+from boxplus.cli.terminal.viewing import ViewOption, viewing
 from boxplus.errors import InputError
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
     from boxplus.cli.ground_truth import Comparison
-    from boxplus.cli.outcome import Outcome
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.outcome import Outcome
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.formats.trajectory import Trajectory
     from boxplus.runs.lidar_inertial.config import RunConfig
     from boxplus.runs.lidar_inertial.earlier_run import Standing
@@ -88,8 +88,8 @@ def lio(
     """
     from boxplus.cli.ground_truth import read_ground_truth
     from boxplus.cli.lidar.several import run_several, several_recordings
-    from boxplus.cli.outcome import reported
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.outcome import reported
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.runs.lidar_inertial.config import load_run_config
     from boxplus.runs.lidar_inertial.earlier_run import standing
     from boxplus.runs.run_folder import RunFolder
@@ -159,8 +159,8 @@ def run(
         BoxplusError: bad input, or results that cannot be written.
     """
     from boxplus.cli.ground_truth import compare_with
-    from boxplus.cli.interrupt import stop_on_interrupt
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.interrupt import stop_on_interrupt
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
     from boxplus.runs.lidar_inertial.earlier_run import finished_run
     from boxplus.runs.lidar_inertial.odometry_run import run_odometry
@@ -236,7 +236,7 @@ def _found_mounting(summary: RunSummary) -> tuple[str, str] | None:
 def _rows(summary: RunSummary, mounting_s: float) -> list[tuple[str, str]]:
     """What the terminal shows of a run of LiDAR and IMU, before which `mounting_s` seconds went into its mounting."""
     from boxplus._words import counted
-    from boxplus.cli.run_terminal import speed_text
+    from boxplus.cli.terminal.run_terminal import speed_text
     from boxplus.sensors.sequencer import BEFORE_START
 
     timing, rows = summary.timing, []

@@ -70,9 +70,9 @@ def localize(
     run_config = lidar_settings(load_localization_config, config, settings, options, T_imu_lidar, threads, map={"save": keep_map})
     folder = output or Path(f"{recording.resolve().stem}_localized")
 
-    from boxplus.cli.interrupt import stop_on_interrupt
-    from boxplus.cli.outcome import reported
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.interrupt import stop_on_interrupt
+    from boxplus.cli.terminal.outcome import reported
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
     from boxplus.runs.localization.folder import claim_localization_folder
     from boxplus.runs.localization.localization_run import run_localization

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from boxplus.cli.help import Command
 from boxplus.cli.lidar.map_grid import grid, height
 from boxplus.cli.options import RESULTS, ConfigOption, JsonOption, OverwriteOption, QuietOption, SettingsOption
+from boxplus.cli.terminal.help import Command
 from boxplus.errors import InputError
 from boxplus.formats.output import advice_to_put_back
 from boxplus.maps.tiles.layout import MANIFEST
 
 if TYPE_CHECKING:
-    from boxplus.cli.terminal import Terminal
+    from boxplus.cli.terminal.terminal import Terminal
     from boxplus.runs.sessions.summary import MergeSummary
 
 map_app = typer.Typer(
@@ -121,8 +121,8 @@ def merge_command(
     Exit code 3: no two of the runs met, and there is no joint map; or something speaks against it (two places of a kind, another
     scale, a run that is not to be trusted itself). Such a one replaces no earlier joint map.
     """
-    from boxplus.cli.outcome import reported
-    from boxplus.cli.terminal import Terminal
+    from boxplus.cli.terminal.outcome import reported
+    from boxplus.cli.terminal.terminal import Terminal
     from boxplus.runs.sessions.config import MergeConfig
     from boxplus.runs.sessions.merge_run import WorseMapError, merge_runs
     from boxplus.runs.settings_file import load_settings
@@ -160,8 +160,8 @@ def update_command(
     Exit code 3: the map stays as it was, as none of the runs met it, one of its own would no longer fit, or something speaks
     against a new run in it (see 'map merge'); or it went on, and has a doubt of before that nobody accepted.
     """
-    from boxplus.cli.outcome import reported
-    from boxplus.cli.terminal import Terminal
+    from boxplus.cli.terminal.outcome import reported
+    from boxplus.cli.terminal.terminal import Terminal
     from boxplus.runs.sessions.update_run import update_map
 
     terminal = Terminal(quiet=quiet, as_json=as_json)

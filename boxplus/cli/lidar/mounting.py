@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.recordings.recording import Recording
     from boxplus.runs.lidar_inertial.extrinsic import Extrinsic
     from boxplus.systems.lidar_inertial_odometry.config import LioConfig

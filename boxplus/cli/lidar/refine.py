@@ -25,7 +25,7 @@ from boxplus.cli.options import (
 
 if TYPE_CHECKING:
     from boxplus.cli.ground_truth import Comparison
-    from boxplus.cli.terminal import Terminal
+    from boxplus.cli.terminal.terminal import Terminal
     from boxplus.formats.trajectory import Trajectory
     from boxplus.runs.refinement.refine_run import RefineResult
     from boxplus.runs.refinement.summary import RefineSummary
@@ -71,9 +71,9 @@ def refine_command(
     folder = output or Path(f"{run.resolve()}_refined")
 
     from boxplus.cli.ground_truth import read_ground_truth
-    from boxplus.cli.interrupt import stop_on_interrupt
-    from boxplus.cli.outcome import reported
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.interrupt import stop_on_interrupt
+    from boxplus.cli.terminal.outcome import reported
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.runs.refinement.folder import claim_refine_folder
     from boxplus.runs.refinement.refine_run import read_odometry_run, refine_run
     from boxplus.runs.run_loop import Progress

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from boxplus.cli import EXIT_INTERRUPTED, EXIT_UNTRUSTED
-from boxplus.cli.interrupt import stop_on_interrupt
-from boxplus.cli.outcome import Outcome
+from boxplus.cli.terminal.interrupt import stop_on_interrupt
+from boxplus.cli.terminal.outcome import Outcome
 from boxplus.errors import BoxplusError, InputError
 
 if TYPE_CHECKING:
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.runs.lidar_inertial.summary import RunSummary
 
     RunOne = Callable[[Path, Path, Outcome, Callable[[], bool]], None]

@@ -28,7 +28,7 @@ from boxplus.cli.options import (
     lidar_settings,
     scan_settings,
 )
-from boxplus.cli.viewing import ViewOption, viewing
+from boxplus.cli.terminal.viewing import ViewOption, viewing
 from boxplus.recordings.options import RecordingOptions
 
 if TYPE_CHECKING:
@@ -100,9 +100,9 @@ def slam(
     folder = output or Path(f"{recording.resolve().stem}_slam")
 
     from boxplus.cli.ground_truth import read_ground_truth
-    from boxplus.cli.interrupt import stop_on_interrupt
-    from boxplus.cli.outcome import reported
-    from boxplus.cli.run_terminal import RunTerminal
+    from boxplus.cli.terminal.interrupt import stop_on_interrupt
+    from boxplus.cli.terminal.outcome import reported
+    from boxplus.cli.terminal.run_terminal import RunTerminal
     from boxplus.recordings import open_recording
     from boxplus.runs.slam.folder import claim_slam_folder
     from boxplus.runs.slam.slam_run import run_slam

@@ -24,7 +24,7 @@ from boxplus.cli.optimization.options import (
     solver_options,
 )
 from boxplus.cli.options import JsonOption, NoReportOption, OverwriteOption, QuietOption, ThreadsOption
-from boxplus.cli.viewing import ViewOption, viewing
+from boxplus.cli.terminal.viewing import ViewOption, viewing
 
 if TYPE_CHECKING:
     from boxplus.formats.reconstructions.reconstruction import Reconstruction, ReconstructionFormat
@@ -97,10 +97,10 @@ def ba(
     (points behind cameras, cameras that do not move apart), 130 interrupted (results up to there are complete).
     """
     with uncollected():
-        from boxplus.cli.interrupt import stop_on_interrupt
         from boxplus.cli.optimization.ba_lines import adjust_line_set, is_line_set
         from boxplus.cli.optimization.terminal import OptimizationTerminal
-        from boxplus.cli.outcome import reported
+        from boxplus.cli.terminal.interrupt import stop_on_interrupt
+        from boxplus.cli.terminal.outcome import reported
         from boxplus.errors import InputError
         from boxplus.formats.reconstructions.reconstruction import (
             read_reconstruction,

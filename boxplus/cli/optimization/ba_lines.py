@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from boxplus.cli.optimization.options import MethodChoice
     from boxplus.cli.optimization.terminal import OptimizationTerminal
-    from boxplus.cli.outcome import Outcome
+    from boxplus.cli.terminal.outcome import Outcome
     from boxplus.formats.reconstructions.vgg_lines import VggLines
     from boxplus.optimization.losses import Loss
     from boxplus.runs.optimization_summary import OptimizationSummary
@@ -37,7 +37,7 @@ def adjust_line_set(
     overwrite: bool,
 ) -> None:
     """Read, adjust, write into `folder` and report, with what became of it in `outcome`."""
-    from boxplus.cli.interrupt import stop_on_interrupt
+    from boxplus.cli.terminal.interrupt import stop_on_interrupt
     from boxplus.formats.reconstructions.vgg_lines import read_vgg_lines
     from boxplus.formats.reconstructions.vgg_writer import write_vgg_lines
     from boxplus.runs.storage.output_folder import output_folder

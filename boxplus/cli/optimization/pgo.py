@@ -24,8 +24,8 @@ from boxplus.cli.optimization.options import (
     solver_options,
 )
 from boxplus.cli.options import JsonOption, NoReportOption, OverwriteOption, QuietOption, ThreadsOption
-from boxplus.cli.own_words import POSE_GRAPH, saying
-from boxplus.cli.viewing import ViewOption, viewing
+from boxplus.cli.terminal.own_words import POSE_GRAPH, saying
+from boxplus.cli.terminal.viewing import ViewOption, viewing
 from boxplus.errors import InputError
 
 if TYPE_CHECKING:
@@ -132,9 +132,9 @@ def pgo(
     are complete).
     """
     with uncollected():
-        from boxplus.cli.interrupt import stop_on_interrupt
         from boxplus.cli.optimization.terminal import OptimizationTerminal
-        from boxplus.cli.outcome import reported
+        from boxplus.cli.terminal.interrupt import stop_on_interrupt
+        from boxplus.cli.terminal.outcome import reported
         from boxplus.formats.graphs.pose_graph_file import graph_format, read_pose_graph, write_pose_graph
         from boxplus.runs.storage.output_folder import output_folder
         from boxplus.systems.pose_graph.pose_graph import PoseGraphConfig, optimize_pose_graph

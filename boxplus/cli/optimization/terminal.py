@@ -15,10 +15,10 @@ from rich.table import Table
 from rich.text import Text
 
 from boxplus.cli.optimization.options import MethodChoice
-from boxplus.cli.terminal import Terminal
+from boxplus.cli.terminal.terminal import Terminal
 
 if TYPE_CHECKING:
-    from boxplus.cli.outcome import Outcome
+    from boxplus.cli.terminal.outcome import Outcome
     from boxplus.optimization.losses import Loss
     from boxplus.optimization.solution import Iteration, Solution
     from boxplus.runs.optimization_summary import OptimizationSummary

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.optimization.incremental.records import NONE, ROOT
-from boxplus.sparse.clique_ordering import order_cliques
+from boxplus.sparse.orderings.clique_ordering import order_cliques
 from boxplus.sparse.symbolic import below_counts, elimination_tree, group_rows, merge_columns, order_groups
 
 Indices = NDArray[np.int64]

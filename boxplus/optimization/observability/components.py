@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from boxplus.optimization.terms.group import Group
 from boxplus.optimization.terms.layout import Layout, connected_numbers
-from boxplus.sparse.components import connected_components
+from boxplus.sparse.graphs.components import connected_components
 
 
 @dataclass(frozen=True, slots=True)

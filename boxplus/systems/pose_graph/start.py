@@ -17,9 +17,9 @@ from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.manifolds import quaternion
 from boxplus.manifolds.se3 import compose_into, inverse_into
 from boxplus.sparse.block_matrix import BlockPattern
-from boxplus.sparse.breadth_first import breadth_first_trees
 from boxplus.sparse.cholesky import SparseCholesky
-from boxplus.sparse.components import connected_components
+from boxplus.sparse.graphs.breadth_first import breadth_first_trees
+from boxplus.sparse.graphs.components import connected_components
 
 _POLAR_ITERATIONS = 30
 

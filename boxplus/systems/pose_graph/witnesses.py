@@ -17,8 +17,8 @@ from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.solver_options import SolverOptions
-from boxplus.sparse.components import connected_components
-from boxplus.sparse.cut_edges import cut_edges
+from boxplus.sparse.graphs.components import connected_components
+from boxplus.sparse.graphs.cut_edges import cut_edges
 from boxplus.systems.pose_graph.doubts import Fit, edge_names, misfit, standing_out
 from boxplus.systems.pose_graph.problem import (
     consecutive_edges,

@@ -17,7 +17,7 @@ from boxplus._arguments import as_settings
 from boxplus._chi_square import chi_square_quantile
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
-from boxplus.sparse.components import connected_components
+from boxplus.sparse.graphs.components import connected_components
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
 from boxplus.systems.sessions.graph import JoinedGraph, join

@@ -197,7 +197,7 @@ def test_bad_input_is_one_paragraph(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_an_interrupt_keeps_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from contextlib import contextmanager
 
-    from boxplus.cli import interrupt
+    from boxplus.cli.terminal import interrupt
 
     @contextmanager
     def at_once(announce: object):  # type: ignore[no-untyped-def]

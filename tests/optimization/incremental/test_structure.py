@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from boxplus.optimization.incremental.structure import eliminate_symbolically
-from tests.sparse.test_clique_ordering import flat, graphs
+from tests.sparse.orderings.test_clique_ordering import flat, graphs
 
 
 @given(graphs(), st.integers(1, 3), st.data())

@@ -53,7 +53,7 @@ def content(folder: SlamFolder) -> dict[str, bytes]:
 
 def resumed(folder: SlamFolder, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr("boxplus.recordings.open_recording", lambda *_: nullcontext(as_recording(WALK)))
-    monkeypatch.setattr("boxplus.cli.interrupt.stop_on_interrupt", lambda _: nullcontext(lambda: True))
+    monkeypatch.setattr("boxplus.cli.terminal.interrupt.stop_on_interrupt", lambda _: nullcontext(lambda: True))
     words = ["slam", "walk.bag", "-o", str(folder.path), "--T-imu-lidar", "xyz: 0 0 0", "--json", "--resume"]
     return CliRunner().invoke(app, words)
 

@@ -93,7 +93,7 @@ def test_an_interrupted_run_goes_on_with_the_same_bits(whole: SlamFolder, tmp_pa
 
 def test_a_run_that_is_interrupted_before_its_first_pose_is_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("boxplus.recordings.open_recording", lambda *_: nullcontext(as_recording(SHORT)))
-    monkeypatch.setattr("boxplus.cli.interrupt.stop_on_interrupt", lambda _: nullcontext(lambda: True))
+    monkeypatch.setattr("boxplus.cli.terminal.interrupt.stop_on_interrupt", lambda _: nullcontext(lambda: True))
     out = SlamFolder(tmp_path / "out")
     words = ["slam", "walk.bag", "-o", str(out.path), "--T-imu-lidar", "xyz: 0 0 0", "--json"]
     called = CliRunner().invoke(app, words)

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._jit import kernel
 from boxplus.errors import InputError
-from boxplus.sparse.dissection.nested_dissection import nested_dissection
-from boxplus.sparse.minimum_degree import minimum_degree
+from boxplus.sparse.orderings.dissection.nested_dissection import nested_dissection
+from boxplus.sparse.orderings.minimum_degree import minimum_degree
 
 Method = Literal["auto", "minimum_degree", "nested_dissection", "natural"]
 

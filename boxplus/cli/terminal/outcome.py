@@ -12,12 +12,12 @@ import typer
 from pydantic import BaseModel, SerializeAsAny
 
 from boxplus.cli import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_UNTRUSTED, print_error
-from boxplus.cli.interrupt import left_at_once
+from boxplus.cli.terminal.interrupt import left_at_once
 from boxplus.errors import BoxplusError, InputError, printable
 
 if TYPE_CHECKING:
     from boxplus.cli.ground_truth import Comparison
-    from boxplus.cli.terminal import Terminal
+    from boxplus.cli.terminal.terminal import Terminal
 
 Ending = Literal["not begun", "finished", "not to be trusted", "interrupted", "failed"]
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.sparse.clique_ordering import order_cliques
-from boxplus.sparse.dissection.coarsening import Graph
-from boxplus.sparse.dissection.separator import SEPARATOR, separate
+from boxplus.sparse.orderings.clique_ordering import order_cliques
+from boxplus.sparse.orderings.dissection.coarsening import Graph
+from boxplus.sparse.orderings.dissection.separator import SEPARATOR, separate
 
 _ONE = np.uint64(1)
 _OUTSIDE = np.uint32(0xFFFFFFFF)

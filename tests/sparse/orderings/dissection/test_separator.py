@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from boxplus.sparse.dissection.coarsening import Graph, coarsen
-from boxplus.sparse.dissection.separator import SEPARATOR, refine, separate
+from boxplus.sparse.orderings.dissection.coarsening import Graph, coarsen
+from boxplus.sparse.orderings.dissection.separator import SEPARATOR, refine, separate
 
 
 def graph_of(count: int, edges: NDArray[np.int64], weight: NDArray[np.int64]) -> Graph:

@@ -8,7 +8,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-from boxplus.cli.examples import EXAMPLES
+from boxplus.cli.terminal.examples import EXAMPLES
 
 _VALUES = {"path": "PATH", "int": "N", "int range": "N", "float": "X", "float range": "X", "str": "TEXT", "list[str]": "TEXT"}
 """What stands for a value, by the name that typer has for its type."""

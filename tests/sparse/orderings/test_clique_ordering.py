@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from boxplus.sparse.clique_ordering import order_cliques
-from boxplus.sparse.minimum_degree import minimum_degree
+from boxplus.sparse.orderings.clique_ordering import order_cliques
+from boxplus.sparse.orderings.minimum_degree import minimum_degree
 
 
 def flat(cliques: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.table import Table
 from rich.text import Text
 
-from boxplus.cli.console import make_console
+from boxplus.cli.terminal.console import make_console
 from boxplus.errors import printable
 
 

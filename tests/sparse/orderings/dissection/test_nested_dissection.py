@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from boxplus.sparse.dissection.coarsening import Graph
-from boxplus.sparse.dissection.nested_dissection import nested_dissection
-from boxplus.sparse.ordering import order
-from tests.sparse.dissection.test_separator import graphs, grid
+from boxplus.sparse.orderings.dissection.coarsening import Graph
+from boxplus.sparse.orderings.dissection.nested_dissection import nested_dissection
+from boxplus.sparse.orderings.ordering import order
+from tests.sparse.orderings.dissection.test_separator import graphs, grid
 
 
 @given(graphs())

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.sparse.minimum_degree import DEAD, ELEMENT, NODE, NONE, VARIABLE, eliminate, insert
+from boxplus.sparse.orderings.minimum_degree import DEAD, ELEMENT, NODE, NONE, VARIABLE, eliminate, insert
 
 Indices = NDArray[np.int64]
 

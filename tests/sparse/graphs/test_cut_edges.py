@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from boxplus.sparse.components import connected_components
-from boxplus.sparse.cut_edges import cut_edges
+from boxplus.sparse.graphs.components import connected_components
+from boxplus.sparse.graphs.cut_edges import cut_edges
 
 
 @given(seed=st.integers(0, 10**6), count=st.integers(1, 25), edges=st.integers(0, 40))

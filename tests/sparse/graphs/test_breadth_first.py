@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, shortest_path
 
-from boxplus.sparse.breadth_first import breadth_first_trees
+from boxplus.sparse.graphs.breadth_first import breadth_first_trees
 
 
 @pytest.mark.parametrize("seed", range(20))

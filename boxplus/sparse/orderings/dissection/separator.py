@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.sparse.dissection.coarsening import Graph, coarsen, draw
+from boxplus.sparse.orderings.dissection.coarsening import Graph, coarsen, draw
 
 SEPARATOR = np.uint8(2)
 """Side of the nodes of the separator; 0 and 1 are the halves."""

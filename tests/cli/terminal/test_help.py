@@ -13,7 +13,7 @@ import typer
 from typer.testing import CliRunner
 
 from boxplus.cli import _COMMANDS, app
-from boxplus.cli.examples import EXAMPLES
+from boxplus.cli.terminal.examples import EXAMPLES
 
 
 def commands(group: Any, ctx: Any, before: str = "") -> Iterator[tuple[str, Any]]:
@@ -113,7 +113,7 @@ def test_a_shell_is_told_commands_and_options() -> None:
 
 
 def test_the_page_of_the_command_line_has_a_row_for_every_command() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "command_line.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "command_line.md").read_text(encoding="utf-8")
     table = page.partition("### Exit codes")[0]
     assert [path for path in ALL if not re.search(rf"`(boxplus )?{path}[` ]", table)] == []
     (told,) = re.findall(r"^(.*) take `--json` and `--quiet`", page, re.MULTILINE)
@@ -122,7 +122,7 @@ def test_the_page_of_the_command_line_has_a_row_for_every_command() -> None:
 
 
 def test_a_command_that_may_end_without_trust_says_so_itself() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "command_line.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "command_line.md").read_text(encoding="utf-8")
     (row,) = (line for line in page.splitlines() if line.startswith("| 3 |"))
     named = [path for path in re.findall(r"`([a-z -]+)`", row) if path in ALL]
     assert len(named) > 5

@@ -15,7 +15,7 @@ from rich.progress import Progress as ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from boxplus.cli.terminal import Terminal
+from boxplus.cli.terminal.terminal import Terminal
 from boxplus.errors import printable
 
 if TYPE_CHECKING:

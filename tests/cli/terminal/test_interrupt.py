@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from boxplus.cli.interrupt import left_at_once, stop_on_interrupt
+from boxplus.cli.terminal.interrupt import left_at_once, stop_on_interrupt
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 ASKING = (signal.SIGINT, signal.SIGTERM)
 PATHS = {**os.environ, "PYTHONPATH": str(ROOT)}
 

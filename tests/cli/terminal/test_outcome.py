@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 
 from boxplus.cli import app
 from boxplus.cli.ground_truth import Comparison
-from boxplus.cli.interrupt import stop_on_interrupt
-from boxplus.cli.outcome import Outcome, reported
-from boxplus.cli.terminal import Terminal
+from boxplus.cli.terminal.interrupt import stop_on_interrupt
+from boxplus.cli.terminal.outcome import Outcome, reported
+from boxplus.cli.terminal.terminal import Terminal
 from boxplus.errors import InputError, OutputError
 
 KEYS = ["input", "output", "outcome", "exit_code", "error", "evaluation", "run"]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as oracle
 
-from boxplus.sparse.components import connected_components
+from boxplus.sparse.graphs.components import connected_components
 
 
 @given(seed=st.integers(0, 10**6), count=st.integers(1, 40), edges=st.integers(0, 40))

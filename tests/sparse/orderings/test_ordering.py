@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from boxplus.errors import InputError
-from boxplus.sparse.ordering import Ordering, order
+from boxplus.sparse.orderings.ordering import Ordering, order
 
 METHODS = ("minimum_degree", "nested_dissection", "natural", "auto")
 

@@ -10,7 +10,7 @@ from typing import cast
 import pytest
 from rich.console import Console
 
-from boxplus.cli.run_terminal import RunTerminal
+from boxplus.cli.terminal.run_terminal import RunTerminal
 from boxplus.runs.run_facts import RunFacts
 from boxplus.runs.run_loop import Progress
 
