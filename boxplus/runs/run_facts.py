@@ -82,7 +82,9 @@ class RunFacts(Part, ABC):
     duration_s: float = Field(0.0, description="between the first and the last estimate [s]")
     path_length_m: float = Field(0.0, description="sum of the distances between successive estimates")
     contradiction: str | None = Field(
-        None, description="why the run is not to be trusted, whatever the status: how the sensors contradict each other"
+        None,
+        description="why the run is not to be trusted, whatever the status: how the sensors contradict each other, or how "
+        "little it knows itself",
     )
     imu_samples_read: int = 0
     rejected: dict[str, dict[str, int]] = Field(default={}, description="what was not used, by place and reason")
@@ -123,9 +125,10 @@ class RunFacts(Part, ABC):
     def describe_state(self) -> str:
         """One sentence on how far the run came, and whether the sensors contradict each other."""
         doubt = "" if self.contradiction is None else f"; not to be trusted: {self.contradiction}"
-        return self._describe_progress() + doubt
+        return self.describe_progress() + doubt
 
-    def _describe_progress(self) -> str:
+    def describe_progress(self) -> str:
+        """One sentence on how far the run came."""
         count, unit = self.estimates
         reached = f"{count} {unit}" + (f" ({self.duration_s:.1f} s)" if count else "")
         if self.state == "finished":

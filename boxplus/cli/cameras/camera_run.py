@@ -85,7 +85,7 @@ def run_cameras(
                 from boxplus.report import write_report
 
                 write_report(folder.path)
-    terminal.print_results(summary, shown, folder.path, FILES)
+    terminal.print_results(summary, shown, folder.path, FILES, doubt=summary.contradiction)
     outcome.end(summary, summary.state, untrusted=summary.contradiction is not None)
     outcome.compare(comparison)
 

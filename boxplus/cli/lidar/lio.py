@@ -208,7 +208,7 @@ def run(
             comparison = compare_with(ground_truth, own.trajectory, own.evaluation, "se3")
             rows.append(comparison.row)
     files = ("report.html", "trajectory.tum", "trajectory.csv", "map.ply", "evaluation.json", "run.json")
-    terminal.print_results(summary, rows, folder, files)
+    terminal.print_results(summary, rows, folder, files, doubt=summary.contradiction)
     if found := _found_mounting(summary):
         terminal.say(found[0])
         terminal.say(found[1], copied=True)

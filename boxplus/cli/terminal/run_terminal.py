@@ -84,7 +84,7 @@ class RunTerminal(Terminal):
         files: Sequence[str],
         *,
         warnings: Iterable[str] = (),
-        doubt: str | None = None,
+        doubt: str | None,
     ) -> None:
         """The facts of the run, its warnings and its files.
 
@@ -92,14 +92,12 @@ class RunTerminal(Terminal):
             summary: of the odometry.
             rows: name and value, after the counts and the start.
             files: names of those that may be there.
-            warnings, doubt: of what was made of the odometry, and why that is not to be trusted.
+            warnings: of what was made of the odometry.
+            doubt: why the results are not to be trusted; None where they are.
         """
         console = self.console
-        good = summary.state == "finished" and summary.contradiction is None and doubt is None
-        told = summary.describe_state()
-        if doubt is not None and doubt != summary.contradiction:
-            known = "" if summary.contradiction is None else summary.contradiction  # it is told, and may be a part of the doubt
-            told = f"{told.removesuffix(f'; not to be trusted: {known}')}; not to be trusted: {doubt}"
+        good = summary.state == "finished" and doubt is None
+        told = summary.describe_progress() + ("" if doubt is None else f"; not to be trusted: {doubt}")
         (console if good else self.alarms).print(Text(printable(told), "green" if good else "yellow"))
         table = Table(box=None, show_header=False, pad_edge=False)
         table.add_column(style="bold")

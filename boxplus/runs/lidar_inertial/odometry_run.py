@@ -292,6 +292,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
             scans_read=statistics.scans_read,
             imu_samples_read=statistics.imu_samples_read,
             contradiction=self._contradiction,
+            unknown_position=self._unknown_position,
             rejected={
                 "recording": self._recording.rejected,
                 "odometry": dict(self._odometry.counters),
@@ -336,7 +337,11 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
         of_lidars = None if self._watch is None else self._watch.contradiction
         found = [self._extrinsic.contradiction, self._odometry.contradiction]
         told = [of_lidars, *(found if any(found) else [self._unknown_mounting])]
-        return "; ".join(dict.fromkeys(text for text in told if text)) or None
+        return "; ".join(dict.fromkeys(text for text in told if text)) or self._unknown_position
+
+    @property
+    def _unknown_position(self) -> str | None:
+        return self._statistics.unknown_position(self._mounting_sigma)
 
     @property
     def _unknown_mounting(self) -> str | None:

@@ -17,6 +17,7 @@ from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING
 
 _VAGUE_M, _VAGUE_SHARE = 0.05, 0.02  # of the way: a position less certain than both is of little use
+_UNKNOWN_M, _UNKNOWN_SHARE = 1.0, 0.2  # and one less certain than these is of none
 
 _PARTS = slice(0, 3), slice(3, 6)  # of the covariance of a mounting: rotation, translation
 _LATE_S = 1.0  # a start in motion may take as long, and a second without a path is not missed
@@ -74,19 +75,26 @@ class RunStatistics(EstimateStatistics):
             mounting_sigma: how uncertain T_imu_lidar was at first, rotation [deg] and translation [m]; None where it is taken for
                 exact.
         """
-        if self._position_sigma_m <= max(_VAGUE_M, _VAGUE_SHARE * self.path_length_m):
-            return []
+        text = self._told_of_position(_VAGUE_M, _VAGUE_SHARE, mounting_sigma)
+        return [] if text is None else [WarningFacts(text=text, count=1)]
+
+    def unknown_position(self, mounting_sigma: tuple[float, float] | None) -> str | None:
+        """The same where the position is so little known that the run is not to be trusted."""
+        return self._told_of_position(_UNKNOWN_M, _UNKNOWN_SHARE, mounting_sigma)
+
+    def _told_of_position(self, least_m: float, share: float, mounting_sigma: tuple[float, float] | None) -> str | None:
+        if self._position_sigma_m <= max(least_m, share * self.path_length_m):
+            return None
         open_scans, why = self.count - self.status["ok"], []
         if mounting_sigma is not None:
             turn, arm = mounting_sigma
             why.append(f"T_imu_lidar was known to {turn:.2g} deg and {arm * 100:.2g} cm at first (better: --T-imu-lidar)")
         if open_scans:
             why.append(f"{open_scans} of {self.count} scans left directions open")
-        text = (
+        return (
             f"by its own covariance the run knows its last position to {_length(self._position_sigma_m)} (1 sigma) only, after a "
             f"way of {_length(self.path_length_m)}: {', and '.join(why) or 'its start, its IMU and what it saw tell no more'}"
         )
-        return [WarningFacts(text=text, count=1)]
 
     def late_start_warnings(self, unstarted: int, refusal: str | None) -> list[WarningFacts]:
         """A warning where the path begins more than a second later than what was read.

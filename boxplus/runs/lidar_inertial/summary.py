@@ -89,6 +89,10 @@ class RunSummary(RunFacts):
     resumed: int = Field(0, description="how often the run went on after it had been killed or interrupted")
     recording: RecordingFacts
     extrinsic: ExtrinsicFacts
+    unknown_position: str | None = Field(
+        None,
+        description="that the run itself does not know where it ends, to a fifth of its way: the `contradiction` if no other",
+    )
     lidars: list[LidarFacts] = Field(default=[], description="of several that were merged; empty for one alone")
     scans: int = 0
     scans_read: int = 0
@@ -100,6 +104,11 @@ class RunSummary(RunFacts):
     def estimates(self) -> tuple[int, str]:
         """See `RunFacts.estimates`."""
         return self.scans, "scans"
+
+    @property
+    def contradiction_of_sensors(self) -> str | None:
+        """`contradiction`, but for a position that the run alone does not know, and something else may."""
+        return None if self.contradiction == self.unknown_position else self.contradiction
 
     @property
     def has_imu(self) -> bool:

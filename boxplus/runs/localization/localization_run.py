@@ -163,10 +163,10 @@ def _summary(
     texts: list[str] = []
     if beside.T_map_world is None:
         # Where sensors contradict each other, what they saw lies nowhere: poses at which some of it fits would mislead.
-        texts = [] if search is None or odometry.contradiction is not None else candidate_texts(search)
+        texts = [] if search is None or odometry.contradiction_of_sensors is not None else candidate_texts(search)
         never = "not found" if beside.found_ns is None else "lost at the end, and not found again"
         why = "nothing was collected for long enough to be looked for" if search is None else search.verdict
-        if odometry.contradiction is not None:
+        if odometry.contradiction_of_sensors is not None:
             why = f"{why or 'see losses'}; sensors contradict each other, and what they saw may fit nowhere: repair that first"
         warnings.append(f"{never}: {why or 'see losses'}")
     return LocalizationSummary(
@@ -180,7 +180,7 @@ def _summary(
         map_report=[printable(text) for text in saved.report],
         map_origin=saved.origin.tolist(),
         places=len(saved.local_maps),
-        contradiction=odometry.contradiction,
+        contradiction=odometry.contradiction_of_sensors,
         scans=odometry.scans,
         status=dict(beside.status),
         found_after_s=None if beside.found_ns is None or beside.first_ns is None else (beside.found_ns - beside.first_ns) * 1e-9,

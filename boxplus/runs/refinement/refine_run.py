@@ -103,9 +103,7 @@ def read_odometry_run(folder: str | Path) -> OdometryRun:
     if not summary.has_imu:
         raise InputError("a run with an IMU", f"one of a LiDAR alone in {path}", "refine runs of LiDAR and IMU")
     if summary.contradiction is not None:
-        raise InputError(
-            "a run that can be trusted", summary.contradiction, "repair what the sensors contradict and run 'boxplus lio' again"
-        )
+        raise InputError("a run that can be trusted", summary.contradiction, "repair that and run 'boxplus lio' again")
     if summary.extrinsic.source == "identity":
         raise InputError(
             "a run in which the mounting of the LiDAR is known", summary.extrinsic.text, "run 'boxplus lio' with --T-imu-lidar"

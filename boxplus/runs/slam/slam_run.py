@@ -34,6 +34,7 @@ from boxplus.runs.slam.result import SlamResult
 from boxplus.runs.slam.spool import ScanSpool
 from boxplus.runs.slam.summary import LEFT_IN_PLACE, SlamSummary, read_slam_summary
 from boxplus.sensors.geodesy import require_utm
+from boxplus.systems.georeference.georeference import Georeference
 from boxplus.systems.slam.correction import Correction
 from boxplus.systems.slam.outcome import SlamOutcome
 from boxplus.systems.slam.slam import Slam
@@ -200,7 +201,7 @@ class _Run:
         if not outcome.accepted:
             told.insert(0, LEFT_IN_PLACE)
         told += pairs_without_maps(*self._decided, len(correction.time_ns))
-        doubt = odometry.contradiction or outcome.doubt
+        doubt = doubt_of_odometry(odometry, earth) or outcome.doubt
         write_corrected_trajectory(own, outcome.placed, is_closed=bool(outcome.accepted))
         if earth is not None:
             write_graph(own.graph, outcome)
@@ -271,6 +272,12 @@ def _told_of_up(outcome: SlamOutcome, level: int | None) -> str:
         f"no IMU tells where down is: surfaces of {maps}; trajectory and map are turned upright, by {tilt:.1f}° from where the "
         "LiDAR began"
     )
+
+
+def doubt_of_odometry(odometry: RunSummary, earth: Georeference | None) -> str | None:
+    """Why the odometry makes the run not to be trusted; one that did not know where it ended may know it by satellites."""
+    is_located = earth is not None and earth.fit is not None
+    return odometry.contradiction_of_sensors if is_located else odometry.contradiction
 
 
 def _waiting(search: LoopSearch) -> Progress:

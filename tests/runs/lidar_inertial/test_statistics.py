@@ -17,9 +17,11 @@ from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.lidar_inertial.statistics import RunStatistics
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
-from boxplus.simulation import Fault, SpinningLidar, simulate
+from boxplus.simulation import Fault, Scenario, Simulation, SpinningLidar, simulate
 from boxplus.simulation.faults import Event, nan_burst
 from boxplus.simulation.live_recording import as_recording
+from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.worlds import sites
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Status
 from tests.systems.lidar_inertial_odometry.small_drives import room_walk
 
@@ -68,6 +70,15 @@ def test_a_warning_where_and_only_where_the_last_position_is_vague(way_m: float,
     limit = max(0.05, 0.02 * way_m)
     if not 0.999 < sigma_m / limit < 1.001:
         assert bool(straight(way_m, sigma_m, axis).vague_warnings(None)) == (sigma_m > limit)
+
+
+@given(st.floats(0.0, 500.0), st.floats(0.0, 200.0), st.integers(0, 1000))
+def test_a_position_that_is_unknown_to_a_metre_and_to_a_fifth_of_the_way_is_told(way_m: float, sigma_m: float, seed: int) -> None:
+    axis = np.random.default_rng(seed).normal(size=3)
+    limit = max(1.0, 0.2 * way_m)
+    if not 0.999 < sigma_m / limit < 1.001:
+        statistics = straight(way_m, sigma_m, axis)
+        assert (statistics.unknown_position(None) is not None) == (sigma_m > limit)
 
 
 def test_what_may_be_behind_it_is_said() -> None:
@@ -148,3 +159,19 @@ def test_a_lever_arm_that_nobody_gave_is_told(tmp_path: Path, given: bool) -> No
     told = [warning.text for warning in summary.warnings if "by its own covariance" in warning.text]
     assert len(told) == (0 if given else 1)
     assert all("T_imu_lidar was known to" in text for text in told)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", ["tunnel", "street"])
+def test_a_drive_along_a_smooth_tunnel_is_not_to_be_trusted(tmp_path: Path, world: str) -> None:
+    """At a constant speed the IMU is as quiet as at rest, and along bare walls the LiDAR sees no difference."""
+    motion = manoeuvres.constant_velocity(6.0, (-24.0, 0.2, 1.8), (8.0, 0.0, 0.0), np.eye(3))
+    site = sites.tunnel(300.0) if world == "tunnel" else sites.street(width=10.0, seed=1)
+    simulation = Simulation(Scenario(world, site, motion, SpinningLidar(azimuth_steps=600), T_imu_lidar=np.eye(4)), 3, 6.0)
+    summary = run_odometry(as_recording(simulation), tmp_path / "out", RunConfig(map=MapConfig(save=False)))
+    if world == "tunnel":
+        assert summary.unknown_position is not None and summary.contradiction == summary.unknown_position
+        assert "by its own covariance the run knows its last position to" in summary.describe_state()
+    else:
+        assert summary.unknown_position is None and summary.contradiction is None
+        assert summary.path_length_m > 30.0

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from html import unescape
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -29,7 +31,7 @@ from boxplus.runs.slam.config import load_slam_config
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
 from boxplus.runs.slam.loop_file import pairs_without_maps, read_loop_decisions
 from boxplus.runs.slam.result import SlamResult, load_slam_result
-from boxplus.runs.slam.slam_run import run_slam
+from boxplus.runs.slam.slam_run import doubt_of_odometry, run_slam
 from boxplus.runs.slam.spool import ScanSpool, SpooledScan, read_spool
 from boxplus.sensors.geodesy import EnuFrame, to_utm
 from boxplus.simulation import SpinningLidar
@@ -39,6 +41,7 @@ from boxplus.simulation.motions import trajectories
 from boxplus.simulation.scenarios import make_scenario, mounting
 from boxplus.simulation.simulation import Simulation
 from boxplus.simulation.worlds.worlds import city
+from boxplus.systems.georeference.georeference import Georeference
 from boxplus.systems.slam.slam import Slam
 from tests.systems.slam.drives import ate
 
@@ -136,6 +139,21 @@ def test_every_loop_is_in_the_table_and_in_the_report(finished: Finished) -> Non
     assert page.count("<img alt=") == 3 + sum(loop.measured > 0 for loop in loops)
     assert finished.folder.odometry.report.exists()
     assert sum(finished.result.summary.loops_refused.values()) == sum(not loop.is_accepted for loop in loops)
+
+
+def test_a_path_that_nothing_showed_is_to_be_trusted_where_satellites_do(finished: Finished) -> None:
+    vague, sensors = "by its own covariance the run knows its last position to 90 m only", "the clocks are apart"
+    located, refused = (cast(Georeference, SimpleNamespace(fit=fit)) for fit in (object(), None))
+    for contradiction, unknown, earth, doubt in (
+        (None, None, located, None),
+        (vague, vague, None, vague),
+        (vague, vague, refused, vague),
+        (vague, vague, located, None),
+        (sensors, vague, located, sensors),
+        (sensors, None, located, sensors),
+    ):
+        odometry = finished.result.odometry.model_copy(update={"contradiction": contradiction, "unknown_position": unknown})
+        assert doubt_of_odometry(odometry, earth) == doubt
 
 
 def test_trajectory_and_map_are_laid_onto_the_earth(finished: Finished) -> None:
