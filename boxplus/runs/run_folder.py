@@ -12,7 +12,7 @@ from pathlib import Path
 from boxplus.errors import InputError
 from boxplus.formats.output import TEMPORARY_SUFFIX
 from boxplus.runs.storage.folder_lock import locked_folder
-from boxplus.runs.storage.output_folder import SUMMARY, doubts_of, output_folder, program_of, refuse_both
+from boxplus.runs.storage.output_folder import SUMMARY, doubts_of, output_folder, program_of, refuse_both, refuse_finished
 
 PLOTS = ("trajectory.png", "status.png", "timing.png", "biases.png")
 _MAP_FILE = re.compile(r"manifest\.json|journal-\d+\.bin|tiles/x[+-]\d+_y[+-]\d+_z[+-]\d+/\d+\.ply")
@@ -78,9 +78,10 @@ class OdometryFolder:
         """The folder as it is, locked while the block runs, for a run that goes on.
 
         Raises:
-            InputError: no run to resume, or one of another command; another process is writing there.
+            InputError: no run to resume, one that is finished, or one of another command; another process is writing there.
         """
         if not self.checkpoint.is_file():
+            refuse_finished(self.path, program)
             raise InputError(
                 "the folder of a run that did not come to its end, with a checkpoint",
                 f"none in {self.path}",

@@ -185,8 +185,14 @@ def test_another_recording_or_setting_is_refused(tmp_path: Path) -> None:
 
 
 def test_nothing_to_resume_is_said(whole: Path, tmp_path: Path) -> None:
-    for folder in (whole, tmp_path / "none"):
-        with pytest.raises(InputError, match="expected the folder of a run that did not come to its end, with a checkpoint"):
+    for folder, message in (
+        (
+            whole,
+            "an unfinished run of 'boxplus lio' to go on with – got one that is finished already, in .* – nothing is left to do",
+        ),
+        (tmp_path / "none", "the folder of a run that did not come to its end, with a checkpoint – got none in"),
+    ):
+        with pytest.raises(InputError, match=f"^expected {message}"):
             run_odometry(walk(), folder, resume=True)
     assert not (tmp_path / "none").exists()
 

@@ -265,15 +265,16 @@ class _Fleet:
         for number, cut in zip(world.members, cuts, strict=True):
             for region in cut.points:
                 regions.setdefault(region, []).append(number)
-        counts = self._all(
+        joined = self._all(
             join_region, [(text, region, numbers, into, config, intensity) for region, numbers in sorted(regions.items())]
         )
         with tempfile.TemporaryDirectory(prefix="boxplus-fleet-") as scratch:
-            write_manifest(Path(scratch), Manifest(config.tile_size, config.voxel, intensity, closed=True))
+            segments = sum(region.segments for region in joined)  # a half-lost map is to be noticed
+            write_manifest(Path(scratch), Manifest(config.tile_size, config.voxel, intensity, closed=True, segments=segments))
             self._store.write(f"{into}/map/{MANIFEST}", (Path(scratch) / MANIFEST).read_bytes())
         if config.ply and isinstance(self._store, SharedFolder):
             merge(self._store.path / into / "map", [self._store.path / into / "map.ply"])
-        return sum(counts)
+        return sum(region.points for region in joined)
 
     def _all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         """The values of tasks none of which may be missing."""

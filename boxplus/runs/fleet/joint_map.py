@@ -45,6 +45,14 @@ class Cut:
     intensity: bool
 
 
+@dataclass(frozen=True, slots=True)
+class JoinedRegion:
+    """What was written of a region of the joint map: points, and the segments that hold them, one for each tile."""
+
+    points: int
+    segments: int
+
+
 def cut_run(store: str, name: str, number: int, T_world_map: Floats, into: str, config: JointMapConfig) -> Cut:
     """Put the scans of a run where its local maps (n, 7) are now, one file for each region, and its trajectory.
 
@@ -81,8 +89,10 @@ def cut_run(store: str, name: str, number: int, T_world_map: Floats, into: str, 
     return Cut({region: sum(map(len, inside.values())) for region, inside in regions.items()}, intensity)
 
 
-def join_region(store: str, region: Region, numbers: Sequence[int], into: str, config: JointMapConfig, intensity: bool) -> int:
-    """Write the tiles of a region from what the sessions `numbers`, in this order, gave to it; returns how many points it has.
+def join_region(
+    store: str, region: Region, numbers: Sequence[int], into: str, config: JointMapConfig, intensity: bool
+) -> JoinedRegion:
+    """Write the tiles of a region from what the sessions `numbers`, in this order, gave to it.
 
     Raises:
         InputError: a part that was written is gone.
@@ -105,7 +115,7 @@ def join_region(store: str, region: Region, numbers: Sequence[int], into: str, c
             write_ply(file, records[:, :3], records[:, 3] if intensity else None)
             place.write(segment_path(Path(f"{into}/map"), index, 0).as_posix(), file.read_bytes())
             count += len(records)
-    return count
+    return JoinedRegion(count, len(tiles))
 
 
 def _part(region: Region, number: int) -> str:

@@ -12,9 +12,8 @@ from boxplus.errors import InputError
 from boxplus.formats.output import EARLIER_SUFFIX, TEMPORARY_SUFFIX
 from boxplus.runs.lidar_inertial.earlier_run import Standing, standing
 from boxplus.runs.run_folder import RunFolder, is_map_file
-from boxplus.runs.slam.summary import read_slam_summary
 from boxplus.runs.storage.folder_lock import locked_folder
-from boxplus.runs.storage.output_folder import output_folder, program_of, refuse_both, state_of
+from boxplus.runs.storage.output_folder import output_folder, program_of, refuse_both, refuse_finished, state_of
 
 PROGRAM = "boxplus slam"
 _NOT_ENDED = ("running", "failed")  # one that was interrupted in good order has left a checkpoint, or has lost it since
@@ -68,8 +67,9 @@ class SlamFolder(RunFolder):
     @contextmanager
     def locked_to_resume(self, program: str) -> Iterator[None]:
         """See `OdometryFolder.locked_to_resume`; there is something to do where the odometry is finished, but not the run."""
-        is_finished = self.summary.is_file() and read_slam_summary(self.summary).state == "finished"
-        if not self.can_go_on() or (is_finished and not self.odometry.checkpoint.is_file()):
+        if not self.odometry.checkpoint.is_file():
+            refuse_finished(self.path, program)
+        if not self.can_go_on():
             raise InputError(
                 "the folder of a run of 'boxplus slam' that did not come to its end, with a checkpoint in odometry/",
                 f"none in {self.path}",

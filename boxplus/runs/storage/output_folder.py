@@ -27,6 +27,25 @@ def refuse_both(overwrite: bool, resume: bool) -> None:
         )
 
 
+def refuse_finished(folder: Path, program: str) -> None:
+    """A run that is finished leaves nothing to go on with.
+
+    Args:
+        folder: of the run.
+        program: who goes on, as `run.json` says; a run of another one is not looked at.
+
+    Raises:
+        InputError: it is finished.
+    """
+    summary = folder / SUMMARY
+    if summary.is_file() and program_of(summary) == program and state_of(summary) == "finished":
+        raise InputError(
+            f"an unfinished run of '{program}' to go on with",
+            f"one that is finished already, in {folder}",
+            "nothing is left to do; to run it anew, give --overwrite in place of --resume",
+        )
+
+
 @contextmanager
 def output_folder(
     folder: str | Path,

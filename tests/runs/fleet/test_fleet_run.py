@@ -107,6 +107,14 @@ def test_recordings_that_met_are_joined_and_failed_ones_named(
     merged = tmp_path / "a" / "merged"
     assert read_merge_summary(merged / "run.json").map_points == status.map_points == TileStore.open(merged / "map").point_count
     assert not (tmp_path / "a" / "map_parts").exists()
+    whole = TileStore.open(merged / "map")
+    assert whole.manifest.segments == len(list((merged / "map").rglob("*.ply"))) > 1 and whole.report == ()
+    shutil.copytree(merged / "map", tmp_path / "half lost")
+    next((tmp_path / "half lost").rglob("*.ply")).unlink()
+    assert (
+        f"1 of the {whole.manifest.segments} segments that were written are not there"
+        in TileStore.open(tmp_path / "half lost").damage[0]
+    )
     # The map is that of 'boxplus map merge', which one process writes.
     shutil.copytree(tmp_path / "a" / "runs", tmp_path / "b" / "runs")
     shutil.copytree(tmp_path / "a" / "pairs", tmp_path / "b" / "pairs")

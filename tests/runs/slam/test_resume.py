@@ -87,7 +87,9 @@ def test_an_interrupted_run_goes_on_with_the_same_bits(whole: SlamFolder, tmp_pa
     run_slam(walk(), out.path, CONFIG, resume=True)
     assert_same(out, whole)
     assert read_slam_summary(out.summary).resumed == 2
-    with pytest.raises(InputError, match="that did not come to its end"):
+    with pytest.raises(
+        InputError, match=r"^expected an unfinished run of 'boxplus slam' to go on with – got one that is finished"
+    ):
         run_slam(walk(), out.path, CONFIG, resume=True)
 
 
