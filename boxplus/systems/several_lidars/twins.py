@@ -1,7 +1,8 @@
 """Is one LiDAR given twice? Its points come under another name then, and count twice as if they had been measured twice.
 
-Two LiDARs never measure the same points, each in its own frame: the noise of ranges alone is a centimetre. A topic that repeats
-another one, cut or thinned out, has none but the other's.
+Two LiDARs never measure the same points, neither each in its own frame nor all in that of the first one: the noise of ranges
+alone is a centimetre. A topic that repeats another one, cut or thinned out, has none but the other's: as they are, or moved to
+another frame (that of the body), which comes out at the same place where it is declared.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from boxplus.sensors.scan import Scan
 
-_SAME_M = 1e-3  # apart, each in the frame of its LiDAR, points are one
+_SAME_M = 1e-3  # apart, points are one
 _SHARE = 0.9  # of its points, that another LiDAR has too
 _LOOKED = 5  # scans in which both have points
 _POINTS = 200  # of a LiDAR, in each
@@ -40,13 +41,17 @@ class Twins:
             return
         seen = np.unique(scan.lidar).tolist()
         ask = [(number, earlier) for earlier, number in combinations(seen, 2) if self._looked[number, earlier] < _LOOKED]
-        own = {number: self._own(scan, number) for number in {number for pair in ask for number in pair}}
-        trees = {earlier: cKDTree(own[earlier]) for earlier in {earlier for _, earlier in ask}}
+        shares = np.zeros_like(self._same, dtype=np.float64)
+        for points_of in (self._own, _of_first):
+            points = {number: points_of(scan, number) for number in {number for pair in ask for number in pair}}
+            trees = {earlier: cKDTree(points[earlier]) for earlier in {earlier for _, earlier in ask}}
+            for number, earlier in ask:
+                some = points[number][:: -(-len(points[number]) // _POINTS)]
+                distance, _ = trees[earlier].query(some, distance_upper_bound=_SAME_M)
+                shares[number, earlier] = max(shares[number, earlier], float(np.isfinite(distance).mean()))
         for number, earlier in ask:
-            some = own[number][:: -(-len(own[number]) // _POINTS)]
-            distance, _ = trees[earlier].query(some, distance_upper_bound=_SAME_M)
             self._looked[number, earlier] += 1
-            self._same[number, earlier] += float(np.isfinite(distance).mean()) >= _SHARE
+            self._same[number, earlier] += shares[number, earlier] >= _SHARE
 
     def of(self, number: int) -> int | None:
         """The LiDAR before it that this one repeats, in all of the scans that were looked at; None if there is none."""
@@ -58,3 +63,8 @@ class Twins:
         T = self._T[number]
         own: NDArray[np.float64] = (scan.p_lidar[scan.lidar == number].astype(np.float64) - T[:3, 3]) @ T[:3, :3]
         return own
+
+
+def _of_first(scan: Scan, number: int) -> NDArray[np.float64]:
+    """(n, 3) points of one LiDAR in the frame of the first one."""
+    return scan.p_lidar[scan.lidar == number].astype(np.float64)

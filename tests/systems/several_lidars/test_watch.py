@@ -84,16 +84,22 @@ def test_what_could_not_be_checked_is_said() -> None:
     assert len(told) == 1 and f"{REAR} could not be checked" in told[0]
 
 
-def repeated(T: np.ndarray, every: int = 1, noise: float = 0.0, silent: int = 0) -> tuple[LidarWatch, list[str]]:
+def repeated(
+    T: np.ndarray, every: int = 1, noise: float = 0.0, silent: int = 0, *, is_moved: bool = False
+) -> tuple[LidarWatch, list[str]]:
     """The first LiDAR, and its points once more, every so many of them, as those of another one declared at T.
 
+    They are those that the first one has in its frame or, `is_moved`, what they are in the frame that T declares.
     In the second of the first `silent` scans the first LiDAR has no points, as where a packet is lost.
     """
     random = np.random.default_rng(3)
     watch, told, scans = LidarWatch([REAR], [T]), list[str](), 0
     for event in simulation():
         if isinstance(event, Scan):
-            again = event.p_lidar[::every].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+            again = event.p_lidar[::every].astype(np.float64)
+            if is_moved:
+                again = ((again - T[:3, 3]) @ T[:3, :3]).astype(np.float32).astype(np.float64)
+            again = again @ T[:3, :3].T + T[:3, 3]
             again += noise * random.standard_normal(again.shape)
             p = np.concatenate([event.p_lidar, again.astype(np.float32)])
             lidar = np.repeat(np.array([0, 1], np.uint8), [len(event), len(again)])
@@ -107,9 +113,9 @@ def repeated(T: np.ndarray, every: int = 1, noise: float = 0.0, silent: int = 0)
 
 
 @pytest.mark.parametrize("T", [np.eye(4), T_IMU_REAR])
-@pytest.mark.parametrize("every", [1, 3])
-def test_a_lidar_that_is_given_twice_is_named(T: np.ndarray, every: int) -> None:
-    watch, told = repeated(T, every)
+@pytest.mark.parametrize(("every", "is_moved"), [(1, False), (3, False), (3, True)])
+def test_a_lidar_that_is_given_twice_is_named(T: np.ndarray, every: int, is_moved: bool) -> None:
+    watch, told = repeated(T, every, is_moved=is_moved)
     assert watch.contradiction is not None and told == [watch.contradiction]
     assert watch.contradiction.startswith(
         "LiDAR /rear is none of its own: its points are those of the first one, to a millimetre"
