@@ -67,4 +67,5 @@ class Twins:
 
 def _of_first(scan: Scan, number: int) -> NDArray[np.float64]:
     """(n, 3) points of one LiDAR in the frame of the first one."""
-    return scan.p_lidar[scan.lidar == number].astype(np.float64)
+    own: NDArray[np.float64] = scan.p_lidar[scan.lidar == number].astype(np.float64)
+    return own
