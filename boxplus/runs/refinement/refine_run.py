@@ -128,7 +128,8 @@ def read_odometry_run(folder: str | Path) -> OdometryRun:
     R_L = quaternion.to_matrix(log.matrix(("imu_lidar_qw", "imu_lidar_qx", "imu_lidar_qy", "imu_lidar_qz")))
     v, b_w, b_a, g, p_L = [log.column(name) for name in ("velocity", "bias_gyro", "bias_accel", "gravity", "imu_lidar_p")]
     states = [NavState(R[k], trajectory.p[k], v[k], b_w[k], b_a[k], g[k], R_L[k], p_L[k]) for k in range(len(times))]
-    rows = OdometryRows(times, states, log.status, trajectory.covariance, unmeasured(log))
+    points = log.column("points_raw").astype(np.int64)
+    rows = OdometryRows(times, states, log.status, trajectory.covariance, unmeasured(log), points)
     return OdometryRun(run, summary, load_run_config(run.config), meant, rows, closed)
 
 

@@ -25,6 +25,7 @@ from boxplus.systems.refinement.slices import Slice, cut, slices_that_fit
 from boxplus.systems.refinement.unshown import after_unshown, open_steps
 
 _LEAST_FOUND = 0.9  # of the odometry's scans, that the recording has
+_MOST_OTHERS = 0.5  # of these, that have another number of points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +38,7 @@ class OdometryRows:
             as long as every scan is "ok".
         unmeasured: (R, 3, 3) sums of t tᵀ over the directions that each scan left open, t the part of a direction that moves
             along the world's axes; None: nobody knows, and any may be.
+        points: (R,) of each scan, those that could not be used included; None: nobody knows.
 
     Raises:
         InputError: a covariance is missing or not finite.
@@ -47,6 +49,7 @@ class OdometryRows:
     status: NDArray[np.str_]
     covariance: NDArray[np.float64] | None = None
     unmeasured: NDArray[np.float64] | None = None
+    points: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         again = "run the odometry again: what it was not shown no refinement can tell"
@@ -73,6 +76,7 @@ class OdometryRows:
             np.array([e.status for e in estimates], dtype=np.str_),
             np.array([e.pose_covariance for e in estimates]).reshape(-1, 6, 6),
             np.array([sum((np.outer(t, t) for t in own), np.zeros((3, 3))) for own in moves]).reshape(-1, 3, 3),
+            np.array([e.points_raw for e in estimates], dtype=np.int64),
         )
 
     @property
@@ -130,6 +134,7 @@ class _Collector:
         self._row: list[int] = []
         self._newest: NDArray[np.float32] | None = None  # points of the latest slice, to which the next one adds
         self._next = 0
+        self._others = 0  # scans with the time of one that the odometry went over, and not its points
 
     def run(self, events: Iterable[Scan | ImuSamples], should_stop: Callable[[], bool]) -> FinishedRun:
         sequencer = Sequencer()
@@ -153,6 +158,8 @@ class _Collector:
             if number is None or number < self._next:
                 continue
             self._next = number + 1
+            if self._rows.points is not None:
+                self._others += len(frame.scan) + sum(frame.scan.rejected.values()) != self._rows.points[number]
             follows = number > 0 and bool(self._time_ns) and self._time_ns[-1] == frame.begin_ns == self._rows.time_ns[number - 1]
             before = self._rows.states[number - 1] if follows else None
             if self._time_ns and before is None:
@@ -184,6 +191,12 @@ class _Collector:
             raise InputError(
                 f"the recording that the odometry went over, with {asked} scans",
                 f"{found} of them",
+                "give the recording with --recording, read with the same options as for the odometry",
+            )
+        if self._others > _MOST_OTHERS * found:  # simulations, and clocks that begin anew with each recording, share their times
+            raise InputError(
+                "the recording that the odometry went over",
+                f"another number of points in {self._others} of the {found} scans that have its times",
                 "give the recording with --recording, read with the same options as for the odometry",
             )
         last = self._rows.states[self._next - 1]

@@ -115,6 +115,10 @@ def test_another_recording_is_refused(case: Case) -> None:
     later = OdometryRows(case.rows.time_ns + 7, case.rows.states, case.rows.status)
     with pytest.raises(InputError, match=r"expected the recording that the odometry went over, with \d+ scans – got 0 of them"):
         collect(case.events, later, case.config, RefinementConfig())  # type: ignore[call-arg]
+    assert case.rows.points is not None
+    other = replace(case.rows, points=case.rows.points + 1)  # a simulation of another world begins at the same time
+    with pytest.raises(InputError, match=r"that the odometry went over – got another number of points in (\d+) of the \1 scans"):
+        collect(case.events, other, case.config, RefinementConfig())  # type: ignore[call-arg]
 
 
 def test_without_planes_nothing_is_refined(case: Case) -> None:
