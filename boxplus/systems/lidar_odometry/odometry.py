@@ -33,6 +33,7 @@ from boxplus.systems.lidar_inertial_odometry.watches.weak_spell import WeakSpell
 from boxplus.systems.lidar_odometry.alignment import Alignment, ScanPoints, align
 from boxplus.systems.lidar_odometry.motion import DOF, VELOCITY, MotionBetween, MotionState, joint_prior, nav_state
 from boxplus.systems.lidar_odometry.observed_density import ObservedDensity
+from boxplus.systems.lidar_odometry.passing import PassingWatch
 from boxplus.systems.lidar_odometry.start import LidarStart, find_lidar_start
 
 _START_S = 0.5
@@ -45,6 +46,7 @@ _UNKNOWN = np.diag([np.pi] * 3 + [1e4] * 3) ** 2  # of the pose against the firs
 _SHOWN = 2.0  # times the threshold at which a direction that was open counts as measured again
 _INDEPENDENT_M = 0.2  # between points whose errors are independent
 _LONGEST_WEAK_S = 2.0  # an open direction may be predicted, as steady as the platform moves
+_MADE_GOOD = 0.5  # of that time by a time in which every direction is shown: noise shows one now and then
 _NODES = 13  # within a scan
 
 
@@ -88,8 +90,10 @@ class LidarOdometry(Snapshots):
         self._datum = MapDatum(nav_state(self._state).pack(), self._cov, SHARED_ERRORS)
         self._untaken = 0
         self._open = False
-        self._weak_since_ns: int | None = None
+        self._judged_ns: int | None = None
+        self._weak_s = 0.0
         self._longest_weak_s = 0.0
+        self._passing = PassingWatch()
         self._gap: str | None = None
         self._last_position = np.zeros(3)
         self._warnings: list[str] = []
@@ -108,7 +112,7 @@ class LidarOdometry(Snapshots):
                 f"for {self._longest_weak_s:.1f} s the scans left a direction open, and without an IMU nothing else tells how "
                 "far the LiDAR went along it"
             )
-        return " ".join(filter(None, [self._gap, open_text])) or None
+        return " ".join(filter(None, [self._gap, self._passing.contradiction, open_text])) or None
 
     @property
     def time_steps(self) -> list[str]:
@@ -161,6 +165,8 @@ class LidarOdometry(Snapshots):
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
         self._density = ObservedDensity()
+        self._passing.restart()
+        self._judged_ns = None
 
     def _try_start(self, *, final: bool = False) -> list[Estimate]:
         """Find the first state, then process every scan that waited for it."""
@@ -217,6 +223,9 @@ class LidarOdometry(Snapshots):
         if taken or len(self.map) == 0:
             self._insert(p_lidar[self._voxel_filter.representatives])
         clock.lap("map insertion")
+        if taken and (text := self._passing.add(scan, self._state, float(found.last.directions.ratios.min()))) is not None:
+            self._warnings.append(text)
+        clock.lap("watch")
         return self._estimate(scan, p_lidar, found, taken, cov_prior[DOF:, DOF:], clock.laps)
 
     def _thinned(self, scan: Scan, motion: MotionBetween) -> ScanPoints:
@@ -234,12 +243,13 @@ class LidarOdometry(Snapshots):
 
     def _status(self, scan: Scan, found: Alignment, taken: bool) -> Status:
         status = self._weak_spell.status(scan.end_ns, found.last.directions, taken)
-        if status != "weak":
-            self._weak_since_ns = None
-        elif self._weak_since_ns is None:
-            self._weak_since_ns = scan.end_ns
-        else:
-            self._longest_weak_s = max(self._longest_weak_s, (scan.end_ns - self._weak_since_ns) * 1e-9)
+        since_s = 0.0 if self._judged_ns is None else (scan.end_ns - self._judged_ns) * 1e-9
+        self._judged_ns = scan.end_ns
+        if status == "weak":
+            self._weak_s += since_s
+        elif status == "ok":
+            self._weak_s = max(0.0, self._weak_s - _MADE_GOOD * since_s)
+        self._longest_weak_s = max(self._longest_weak_s, self._weak_s)
         return status
 
     def _estimate(
