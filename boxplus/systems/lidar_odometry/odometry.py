@@ -223,7 +223,8 @@ class LidarOdometry(Snapshots):
         if taken or len(self.map) == 0:
             self._insert(p_lidar[self._voxel_filter.representatives])
         clock.lap("map insertion")
-        if taken and (text := self._passing.add(scan, self._state, float(found.last.directions.ratios.min()))) is not None:
+        text = self._passing.add(scan, self._state, found.last.directions, self.map) if taken else None
+        if text is not None:
             self._warnings.append(text)
         clock.lap("watch")
         return self._estimate(scan, p_lidar, found, taken, cov_prior[DOF:, DOF:], clock.laps)

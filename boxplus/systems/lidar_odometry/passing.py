@@ -3,7 +3,8 @@
 On a road between rails and walls the points look the same from every place. A registration, point to plane, stays at rest with
 them while the platform drives, well determined by their ripples, and no scan is weak. What does change are posts, bushes and
 signs, and they have one motion in common (`common_motion`). Where scans show a direction poorly, that motion is asked for: a
-start goes by it, and an estimate that has another one later is contradicted.
+start goes by it, and an estimate that has another one later is contradicted. Nothing passes in a bare tunnel: there it is asked
+whether any surface faces the way at all (`surfaces_across`), or the scans know of it by their own pattern only.
 """
 
 from __future__ import annotations
@@ -15,12 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._words import signed
+from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.manifolds import so3
+from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.local_maps.vertical import find_vertical
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import CommonMotion, common_motion
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Poses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
+from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surfaces_across
 from boxplus.systems.lidar_odometry.motion import MotionState
 
 Floats = NDArray[np.float64]
@@ -28,7 +32,11 @@ Floats = NDArray[np.float64]
 _SCANS = 6  # in a row that are asked, as `common_motion` needs
 _EVERY_S = 3.0  # where all is well: it takes the time of twenty scans
 _POORLY = 12.0  # least ratio of a measured direction (`filtering.degeneracy`) below which scans are asked
+_HARDLY = 6.0  # and below which what a scan says of it may be its own pattern
+_POINTS = 4000  # of a scan, whose surfaces are looked at
 _APART_M_S, _APART_SHARE = 2.0, 0.1  # velocities that differ by both together are two
+_OF_WAY = 0.5  # share of a direction that is a shift and no turn
+_LEVEL = 0.7  # cosine between a way and the LiDAR's own z axis, at most
 _TOGETHER = 2  # judgements in a row that say the same
 
 
@@ -50,21 +58,25 @@ class PassingWatch:
         self._scans.clear()
         self._against, self._next_ns = 0, None
 
-    def add(self, scan: Scan, state: MotionState, least_ratio: float) -> str | None:
+    def add(self, scan: Scan, state: MotionState, directions: PoseDirections, tree: IkdTree) -> str | None:
         """Take a scan that fitted the map; returns what speaks against the estimate, when it is found.
 
         Args:
             scan: as it was measured.
             state: where the LiDAR was at its end.
-            least_ratio: of the directions that it measured.
+            directions: what it determines.
+            tree: the map.
         """
-        self._scans.append((scan, state, least_ratio))
+        self._scans.append((scan, state, float(directions.ratios.min())))
         is_due = self._next_ns is None or scan.end_ns >= self._next_ns
         if self.contradiction is not None or len(self._scans) < _SCANS or not is_due:
             return None
-        if float(np.median([ratio for _, _, ratio in self._scans])) >= _POORLY:
+        ratio = float(np.median([ratio for _, _, ratio in self._scans]))
+        if ratio >= _POORLY:
             return None
         text = self._difference()
+        if text is None and ratio < _HARDLY:
+            text = _open_way(scan, state, directions, tree)
         self._against = 0 if text is None else self._against + 1
         self._next_ns = scan.end_ns + round(_EVERY_S * 1e9) if text is None else None
         self._scans.clear()
@@ -93,6 +105,25 @@ class PassingWatch:
             f"at {signed(estimated, 1)} m/s: surroundings that look the same from every place (a road, rails, walls) went along "
             "with it, and its way is wrong; take an IMU, or begin at rest where something faces the way"
         )
+
+
+def _open_way(scan: Scan, state: MotionState, directions: PoseDirections, tree: IkdTree) -> str | None:
+    """That no surface faces the way that a scan knows least, though it seemed to measure it; None where one does."""
+    column = directions.vectors[3:, int(directions.ratios.argmin())]
+    length = float(np.linalg.norm(column))
+    if length < _OF_WAY or directions.weak.any():  # a turn, or said to be open already
+        return None
+    axis = column / length
+    if abs(axis @ state.R_world_lidar[:, 2]) > _LEVEL:  # nothing drives there, and few rings see floors that would show it
+        return None
+    p_lidar = scan.p_lidar[:: -(-len(scan) // _POINTS)].astype(np.float64)
+    p_world = p_lidar @ state.R_world_lidar.T + state.p_world_lidar
+    if surfaces_across(tree, p_world, state.p_world_lidar, axis, float(directions.ratios.min())):
+        return None
+    return (
+        f"nothing that the LiDAR sees faces the way along {signed(axis, 2)} (in the world frame): what its scans say of it is "
+        "their own pattern, and how far it went is not known"
+    )
 
 
 def passing_motion(scans: Sequence[Scan], poses: Poses) -> CommonMotion | None:

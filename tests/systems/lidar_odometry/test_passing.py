@@ -8,20 +8,23 @@ from functools import cache
 import numpy as np
 import pytest
 
+from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.manifolds import so3
+from boxplus.maps.ikd_tree import IkdTree
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation
 from boxplus.simulation.lidar import SpinningLidar
 from boxplus.simulation.motions.manoeuvres import constant_velocity, level
 from boxplus.simulation.scenarios import Scenario, mounting
-from boxplus.simulation.worlds.sites import highway
+from boxplus.simulation.worlds.sites import highway, tunnel
+from boxplus.simulation.worlds.world import World, box
 from boxplus.systems.lidar_inertial_odometry.watches.weak_spell import WeakSpell
 from boxplus.systems.lidar_odometry.motion import MotionState
 from boxplus.systems.lidar_odometry.odometry import LidarOdometry
 from boxplus.systems.lidar_odometry.passing import PassingWatch, turning_along
 
 SPEED_M_S = 25.0
-POOR, WELL = 8.0, 30.0  # ratios of a direction that is measured
+HARDLY, POOR, WELL = 2.0, 8.0, 30.0  # ratios of a direction that is measured
 
 
 @cache
@@ -42,9 +45,21 @@ def true_states(simulation: Simulation, scans: Sequence[Scan]) -> list[MotionSta
     return [MotionState(t, R[k], p[k], still, motion.v_world_imu[k]) for k, t in enumerate(times.tolist())]
 
 
-def told(scans: Sequence[Scan], states: Sequence[MotionState], ratio: float) -> list[str]:
-    watch = PassingWatch()
-    found = [watch.add(scan, state, ratio) for scan, state in zip(scans, states, strict=True)]
+def directions(ratio: float, axis: Sequence[float] = (1.0, 0.0, 0.0)) -> PoseDirections:
+    """Of which the least known one is a shift along an axis of the world."""
+    vectors, ratios = np.eye(6)[:, [3, 4, 5, 0, 1, 2]], np.full(6, 100.0)
+    vectors[3:, 0], ratios[0] = axis, ratio
+    return PoseDirections(ratios, vectors, 10.0, np.zeros(6, bool), np.eye(6))
+
+
+def told(
+    scans: Sequence[Scan], states: Sequence[MotionState], ratio: float, axis: Sequence[float] = (1.0, 0.0, 0.0)
+) -> list[str]:
+    watch, tree = PassingWatch(), IkdTree(cell_size=0.25)
+    found = []
+    for scan, state in zip(scans, states, strict=True):
+        tree.insert(scan.p_lidar[::5] @ state.R_world_lidar.T + state.p_world_lidar, downsample=True)
+        found.append(watch.add(scan, state, directions(ratio, axis), tree))
     assert watch.contradiction == next((text for text in found if text), None)
     return [text for text in found if text]
 
@@ -90,6 +105,20 @@ def test_a_difference_of_one_window_contradicts_nothing() -> None:
 def test_at_rest_nothing_passes() -> None:
     simulation, scans = drive(0.0, count=14)
     assert told(scans, true_states(simulation, scans), POOR) == []
+
+
+@pytest.mark.parametrize("is_closed", [False, True])
+def test_a_way_that_nothing_faces_is_open(is_closed: bool) -> None:
+    """Rings at the corners of a bare tunnel seem to face the way: by their ratio it was measured, and it was not."""
+    motion = constant_velocity(6.0, (-60.0, 0.0, 1.6), (2.0, 0.0, 0.0), level(0.0))
+    world = World([*tunnel().solids, box((-51.0, 0.0, 3.0), (0.3, 9.0, 6.0))]) if is_closed else tunnel()
+    lidar = SpinningLidar(channels=32, azimuth_steps=900)
+    simulation = Simulation(Scenario("tunnel", world, motion, lidar, T_imu_lidar=np.eye(4)), seed=5, duration_s=1.5)
+    scans = [simulation.scan(k) for k in range(13)]
+    found = told(scans, true_states(simulation, scans), HARDLY)
+    said = [text.startswith("nothing that the LiDAR sees faces the way along (+1.00, +0.00, +0.00)") for text in found]
+    assert said == ([] if is_closed else [True])
+    assert told(scans, true_states(simulation, scans), HARDLY, (0.0, 0.0, 1.0)) == []  # nothing drives upwards
 
 
 def test_attitudes_in_between_turn_as_those_beside_them() -> None:
