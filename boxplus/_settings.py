@@ -119,19 +119,23 @@ def _place(kind: type[BaseModel], where: Place) -> Place:
     for depth, name in enumerate(where):
         if model is None:
             return where[: depth + 1] if isinstance(name, int) else where[:depth]
-        model = _held(model, str(name))
+        model = model if isinstance(name, int) else _held(model, str(name))
     return where
 
 
 def _owner(kind: type[BaseModel], place: Place) -> type[BaseModel]:
     """The model that the last name of a place belongs to: settings may hold others."""
     for name in place[:-1]:
-        kind = _held(kind, str(name)) or kind
+        kind = kind if isinstance(name, int) else _held(kind, str(name)) or kind
     return kind
 
 
 def _held(kind: type[BaseModel], name: str) -> type[BaseModel] | None:
-    """The model that a setting holds, where it does."""
+    """The model that a setting holds, or several of, where it does."""
     field = kind.model_fields.get(name)
-    kinds = () if field is None else (field.annotation, *get_args(field.annotation))
-    return next((one for one in kinds if isinstance(one, type) and issubclass(one, BaseModel)), None)
+    kinds = [] if field is None else [field.annotation]
+    for one in kinds:
+        if isinstance(one, type) and issubclass(one, BaseModel):
+            return one
+        kinds += get_args(one)
+    return None

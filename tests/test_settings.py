@@ -6,6 +6,8 @@ import pytest
 
 import boxplus as bp
 from boxplus._settings import Settings, suggestion
+from boxplus.errors import InputError
+from boxplus.recordings.options import RecordingOptions
 from boxplus.runs.lidar_inertial.config import RunConfig
 from boxplus.runs.settings_file import load_settings
 
@@ -39,6 +41,15 @@ def test_settings_in_settings_are_named_with_their_place():
         bp.BundleAdjustmentConfig(solver={"methods": "dogleg"})
     with pytest.raises(bp.InputError, match=r"for solver.method of BundleAdjustmentConfig \(how a step is chosen\)"):
         bp.BundleAdjustmentConfig(solver={"method": "newton"})
+
+
+def test_settings_in_one_of_several_settings_are_named_with_their_place():
+    with pytest.raises(InputError, match=r"^expected a setting of OtherLidar – got 'time_offset' – did you mean time_offset_s\?"):
+        RecordingOptions(lidar_topic="/front", other_lidars=({"topic": "/rear", "time_offset": 0.1},))
+    with pytest.raises(
+        InputError, match=r"^expected other_lidars.0.topic of RecordingOptions \(topic of its clouds\).* – got nothing"
+    ):
+        RecordingOptions(lidar_topic="/front", other_lidars=({"time_offset_s": 0.1},))
 
 
 def test_settings_stay_as_they_are_made():

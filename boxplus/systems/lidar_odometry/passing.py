@@ -30,7 +30,7 @@ from boxplus.systems.lidar_odometry.motion import MotionState
 Floats = NDArray[np.float64]
 
 _SCANS = 6  # in a row that are asked, as `common_motion` needs
-_EVERY_S = 3.0  # where all is well: it takes the time of twenty scans
+_EVERY_S, _SELDOM_S = 3.0, 30.0  # where all is well, at first and later on: it takes the time of twenty scans
 _POORLY = 12.0  # least ratio of a measured direction (`filtering.degeneracy`) below which scans are asked
 _HARDLY = 6.0  # and below which what a scan says of it may be its own pattern
 _POINTS = 4000  # of a scan, whose surfaces are looked at
@@ -51,12 +51,13 @@ class PassingWatch:
         self.contradiction: str | None = None
         self._scans: deque[tuple[Scan, MotionState, float]] = deque(maxlen=_SCANS)
         self._next_ns: int | None = None
+        self._every_s = _EVERY_S
         self._against = 0
 
     def restart(self) -> None:
         """The scans to come do not belong to those before."""
         self._scans.clear()
-        self._against, self._next_ns = 0, None
+        self._against, self._next_ns, self._every_s = 0, None, _EVERY_S
 
     def add(self, scan: Scan, state: MotionState, directions: PoseDirections, tree: IkdTree) -> str | None:
         """Take a scan that fitted the map; returns what speaks against the estimate, when it is found.
@@ -78,7 +79,10 @@ class PassingWatch:
         if text is None and ratio < _HARDLY:
             text = _open_way(scan, state, directions, tree)
         self._against = 0 if text is None else self._against + 1
-        self._next_ns = scan.end_ns + round(_EVERY_S * 1e9) if text is None else None
+        self._next_ns = None
+        if text is None:
+            self._next_ns = scan.end_ns + round(self._every_s * 1e9)
+            self._every_s = min(2.0 * self._every_s, _SELDOM_S)
         self._scans.clear()
         if self._against < _TOGETHER:
             return None
