@@ -186,7 +186,9 @@ class _Run(CameraRun[Estimate, DirectSummary]):
                 f"none in {self._before_start} frames (at the end: {self._start_problem})",
                 "move the camera sideways, or record depth, a second camera or an IMU",
             )
-        rejected = "; ".join(f"{count} × {what}" for what, count in self._pairs.rejected.items())
+        rejected = "; ".join(
+            f"{count} × {what}" for what, count in (self.recording.rejected | dict(self._pairs.rejected)).items()
+        )
         return InputError(
             "frames of an image and its depth, or of left and right",
             f"none ({rejected or 'no images'})",

@@ -228,7 +228,8 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
 
     def nothing_found(self) -> InputError:
         """See `RunLoop.nothing_found`."""
-        reasons = [f"{count} × {reason}" for reason, count in self._odometry.counters.items()]
+        rejected = self.recording.rejected | dict(self._odometry.counters)
+        reasons = [f"{count} × {reason}" for reason, count in rejected.items()]
         if self._odometry.start_problem:
             reasons.append(self._odometry.start_problem)
         cause = f"; {MAY_BE}: {'; '.join(self._causes)}" if self._causes else ""

@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,13 +28,17 @@ from boxplus.report import write_report
 from boxplus.report.cameras.visual_data import load_visual_run
 from boxplus.runs.cameras.folder import VioFolder
 from boxplus.runs.cameras.landmark_file import read_lines, write_lines
+from boxplus.runs.direct.direct_run import run_direct_odometry
 from boxplus.runs.settings_file import load_settings
 from boxplus.runs.visual_inertial.config import VioRunConfig
 from boxplus.runs.visual_inertial.frame_log import read_frame_log
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
 from boxplus.runs.visual_inertial.summary import LengthFacts, VioSummary, read_vio_summary
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
+from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, make_rig, simulate_cameras, write_camera_recording
+from boxplus.simulation.cameras.faults import CameraFault
 from boxplus.systems.visual_inertial_odometry import VioConfig, VioEstimate
 from tests.report.unpacked import figures_of
 
@@ -271,6 +277,22 @@ def test_no_start_in_the_whole_recording_is_an_error_with_its_number(tmp_path: P
         run_visual_odometry(as_camera_recording(simulation), tmp_path / "out", CONFIG)
     summary = read_vio_summary(tmp_path / "out" / "run.json")
     assert summary.state == "failed" and summary.start is None and summary.frames_before_start > 5
+
+
+def test_images_that_are_not_of_the_stated_size_are_the_reason_of_a_run_without_a_frame(tmp_path: Path) -> None:
+    simulation = simulate_cameras("room", 1, duration_s=0.6, rig=make_rig("mono", None, 0.2, 15.0))
+    sensor = simulation.scenario.rig.cameras[0].sensor
+    width, height = sensor.width, sensor.height
+
+    def halved(events: Iterable[CameraImage | ImuSamples]) -> Iterator[CameraImage | ImuSamples]:
+        for event in events:
+            yield replace(event, pixels=event.pixels[::2, ::2]) if isinstance(event, CameraImage) else event
+
+    fault = CameraFault("halved", "images of half the size", (), "inspect", events=halved)
+    with pytest.raises(InputError, match=rf"no images .* × messages: image of cam0 \(.* has {width}x{height}\)"):
+        run_visual_odometry(as_camera_recording(simulation, fault), tmp_path / "vio", CONFIG)
+    with pytest.raises(InputError, match=rf"none \(.* × messages: image of cam0 \(.* has {width}x{height}\)"):
+        run_direct_odometry(as_camera_recording(simulation, fault), tmp_path / "vo")
 
 
 def test_the_command_compares_with_the_truth_and_says_how_it_ended(recorded: Path, tmp_path: Path) -> None:
