@@ -27,6 +27,7 @@ from boxplus.runs.visual_inertial.frame_log import FrameLogWriter
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
 from boxplus.runs.visual_inertial.summary import CameraFacts, LengthFacts, VioSummary
 from boxplus.sensors.camera_image import CameraImage
+from boxplus.systems.visual_inertial_odometry.corners.carried import CARRIED
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 from boxplus.systems.visual_inertial_odometry.odometry import REPEATED, VisualInertialOdometry
 from boxplus.systems.visual_inertial_odometry.start.start import Start
@@ -45,6 +46,7 @@ _OWN_STATE = (
     "_troubled_ns", "_turning", "_image_gaps",
 )  # fmt: skip
 _MUCH_LOST = 0.15  # share of the frames
+_CARRIED = 10  # corners that moved along with the camera, which are no accident
 _VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark does not enter the map
 
 
@@ -251,6 +253,13 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         if repeated:
             text = f"{repeated} {REPEATED}: a driver or the recording delivers images again with new stamps; they are left out"
             shared["warnings"].append(WarningFacts(text=text, count=repeated))
+        carried = self._rejected[CARRIED]
+        if carried >= _CARRIED:
+            text = (
+                f"{carried} corners stood still in the image while the camera turned: dirt on the lens, text in the image, or a "
+                "part of the platform in view; they were left out"
+            )
+            shared["warnings"].append(WarningFacts(text=text, count=carried))
         shared["warnings"] += [WarningFacts(text=doubt, count=1) for doubt in self._doubts]
         shared["warnings"] += [WarningFacts(text=f"{MAY_BE}: {cause}", count=1) for cause in self._causes]
         return VioSummary(

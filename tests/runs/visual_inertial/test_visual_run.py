@@ -40,6 +40,7 @@ from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, make_rig, simulate_cameras, write_camera_recording
 from boxplus.simulation.cameras.faults import CameraFault
 from boxplus.systems.visual_inertial_odometry import VioConfig, VioEstimate
+from boxplus.systems.visual_inertial_odometry.corners.carried import CARRIED
 from tests.report.unpacked import figures_of
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="corners are followed with OpenCV")
@@ -293,6 +294,29 @@ def test_images_that_are_not_of_the_stated_size_are_the_reason_of_a_run_without_
         run_visual_odometry(as_camera_recording(simulation, fault), tmp_path / "vio", CONFIG)
     with pytest.raises(InputError, match=rf"none \(.* × messages: image of cam0 \(.* has {width}x{height}\)"):
         run_direct_odometry(as_camera_recording(simulation, fault), tmp_path / "vo")
+
+
+@pytest.mark.slow
+def test_a_part_of_the_platform_in_view_is_left_out_and_told(tmp_path: Path) -> None:
+    simulation = simulate_cameras("room_moving", 4, duration_s=6.0, rig=make_rig("stereo", None, 0.35, 15.0))
+    height = simulation.scenario.rig.cameras[0].sensor.height
+    arm = np.random.default_rng(0).integers(40, 220, (height, 400), np.uint8).repeat(3, axis=0).repeat(3, axis=1)
+
+    def with_arm(events: Iterable[CameraImage | ImuSamples]) -> Iterator[CameraImage | ImuSamples]:
+        for event in events:
+            if isinstance(event, CameraImage):
+                pixels = event.pixels.copy()
+                pixels[2 * height // 3 :] = arm[: height - 2 * height // 3, : pixels.shape[1]]
+                event = replace(event, pixels=pixels)
+            yield event
+
+    fault = CameraFault("arm", "an arm fills a third of the view", (), "estimator", events=with_arm)
+    summary = run_visual_odometry(as_camera_recording(simulation, fault), tmp_path / "out")
+    (said,) = [warning.text for warning in summary.warnings if "part of the platform in view" in warning.text]
+    assert "left out" in said and summary.rejected["corners"][CARRIED] >= 10
+    assert summary.contradiction is None and summary.status.get("ok", 0) > 30
+    sound = run_visual_odometry(as_camera_recording(simulation), tmp_path / "sound")
+    assert CARRIED not in sound.rejected["corners"] and not any("platform" in warning.text for warning in sound.warnings)
 
 
 def test_the_command_compares_with_the_truth_and_says_how_it_ended(recorded: Path, tmp_path: Path) -> None:

@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 
 from boxplus._extras import require
 from boxplus._jit import kernel
+from boxplus.manifolds import so3
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
+from boxplus.systems.visual_inertial_odometry.corners.carried import CARRIED, CarriedCorners
 from boxplus.systems.visual_inertial_odometry.corners.centres import centred
 from boxplus.systems.visual_inertial_odometry.corners.partners import FEWEST, FLAT, LEAST_SHARE, NEAREST, Partners
 from boxplus.systems.visual_inertial_odometry.corners.shutter import BodyMotion, at_once
@@ -96,6 +98,7 @@ class FeatureTracker:
         self._time_ns: int | None = None
         self._rho = np.zeros(0)
         self._next_id = 0
+        self._carried = CarriedCorners(rig.cameras[0].model.fx)
         self.opencv_s = 0.0
         T = [camera.T_imu_camera for camera in rig.cameras]
         self._R_imu_first = T[0][:3, :3]
@@ -138,6 +141,10 @@ class FeatureTracker:
             inside = self._inside(there, 0)
             rejected["left the image"] += int((kept & ~inside).sum())
             kept &= inside
+            angle = float(np.linalg.norm(so3.log(R_before_now)))
+            carried = self._carried.find(self._ids, old, self._by_turn(R_before_now), there, kept, angle)
+            rejected[CARRIED] += int(carried.sum())
+            kept &= ~carried
             self._rho = rho
             self._pixels[:, 0] = there
             motion = float(np.median(np.linalg.norm(there[kept] - old[kept], axis=1))) if kept.any() else motion
@@ -232,6 +239,12 @@ class FeatureTracker:
         ahead = seen & (points[:, 2] > 0.2)
         rho = np.where(ahead, self._rho / np.where(ahead, points[:, 2], 1.0), 0.0)
         return np.where(ahead[:, None], pixels, self._pixels[:, 0]), rho
+
+    def _by_turn(self, R_before_now: Floats) -> Floats:
+        """Where the rotation of the IMU alone puts the corners in the first image (n, 2), NaN outside of it."""
+        R_now_before = self._R_imu_first.T @ R_before_now.T @ self._R_imu_first
+        pixels, seen = self._rig.cameras[0].model.project(self._rays[:, 0] @ R_now_before.T)
+        return np.where(seen[:, None], pixels, np.nan)
 
     def _flow(
         self, first: Grey, second: Grey, old: Floats, guess: Floats, rejected: Counter[str]
@@ -351,7 +364,8 @@ class FeatureTracker:
         """(H, W) 255 in cells without a corner and around them no nearer to one than half a cell, else 0."""
         mask = np.full(shape, 255, np.uint8)
         mask[:_BORDER], mask[-_BORDER:], mask[:, :_BORDER], mask[:, -_BORDER:] = 0, 0, 0, 0
-        _clear(np.rint(self._pixels[:, 0]).astype(np.int64), cell // 2, mask)
+        for pixels in (self._pixels[:, 0], self._carried.places):
+            _clear(np.rint(pixels).astype(np.int64), cell // 2, mask)
         return mask
 
 
