@@ -16,7 +16,9 @@ from boxplus.recordings.cameras.info import CameraRecordingInfo, CameraStream
 from boxplus.recordings.info import Evidence
 from boxplus.recordings.stream_checks import check_rate
 from boxplus.runs.inspection.cameras.comparison import Comparison
+from boxplus.runs.inspection.cameras.stereo import check_synchronisation
 from boxplus.runs.inspection.cameras.views import GAP_FACTOR, Views, check_corners, check_views
+from boxplus.runs.inspection.imu_checks import check_repeats, check_saturation
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.imu import ImuSamples
 
@@ -49,7 +51,12 @@ def likely_causes(
     pictures = _pictures(info, cameras)
     found = [finding for camera in pictures for finding in _of_images(camera.name, views[camera.index])]
     found += check_corners(pictures[0].name, comparison.turns.followed, views[pictures[0].index])
-    return _told(found + comparison.of_cameras() + (comparison.with_imu(imu) if with_imu and len(imu) else []))
+    if len(pictures) > 1:
+        found.append(check_synchronisation(pictures[:2], [views[camera.index].time_ns for camera in pictures[:2]]))
+    found += comparison.of_cameras()
+    if with_imu and len(imu):
+        found += [*check_repeats(imu), check_saturation(imu), *comparison.with_imu(imu)]
+    return _told(found)
 
 
 def calibration_doubts(info: CameraRecordingInfo, events: Iterator[CameraEvent], around_ns: int) -> list[str]:

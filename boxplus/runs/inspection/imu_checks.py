@@ -23,6 +23,7 @@ _LARGEST_BIAS_RAD_S = 0.15
 _GRAVITY_OFF = 0.03
 _SATURATED_GYRO = 4.0
 _SATURATED_ACCEL = 25.0
+_REPEATED, _REPEATED_S = 20, 0.2  # samples and their time
 
 
 def _windows(imu: ImuSamples, seconds: float) -> list[slice]:
@@ -151,6 +152,24 @@ def check_values(imu: ImuSamples) -> list[Evidence]:
     if not bad:
         return []
     return [Evidence("imu_values", ", ".join(bad), "warning", f"of {len(imu)} samples: dropped, which leaves gaps")]
+
+
+def check_repeats(imu: ImuSamples) -> list[Evidence]:
+    """Stretches in which a sensor repeats one value on all axes; as a coarse one may at rest, it is asked for causes only."""
+    found = []
+    for name, values in (("gyroscope", imu.gyro), ("accelerometer", imu.accel)):
+        same = np.concatenate([[False], (np.diff(values, axis=0) == 0.0).all(axis=1), [False]])
+        edges = np.flatnonzero(np.diff(same.astype(np.int8)))
+        if not len(edges):
+            continue
+        begin, end = max(zip(edges[::2], edges[1::2], strict=True), key=lambda run: imu.time_ns[run[1]] - imu.time_ns[run[0]])
+        lasting_s = (imu.time_ns[end] - imu.time_ns[begin]) * 1e-9
+        if end - begin >= _REPEATED and lasting_s >= _REPEATED_S:
+            found.append(f"the {name} for {lasting_s:.2f} s")
+    if not found:
+        return []
+    text = f"{' and '.join(found)} to the bit on all axes: its driver stalls, or fills gaps with what came last"
+    return [Evidence("imu_repeats", "one value", "warning", text)]
 
 
 def liveliest_stretch(imu: ImuSamples, seconds: float, first: float = 0.0, last: float = 1.0) -> tuple[int, int]:

@@ -77,7 +77,9 @@ def test_sixteen_seconds_are_looked_at(
     def samples() -> Iterator[CameraEvent]:
         for k in range(120):
             read.append(0.5 * k)
-            yield ImuSamples.from_arrays(np.array([500_000_000 * k]), np.zeros((1, 3)), np.zeros((1, 3)))
+            yield ImuSamples.from_arrays(
+                np.array([500_000_000 * k]), np.full((1, 3), 0.1 * (k % 2)), np.full((1, 3), 0.1 * (k % 2))
+            )
 
     assert likely_causes(info, samples(), 1, None if trouble_s is None else round(1e9 * trouble_s)) == []
     assert abs(read[-1] - read_s) <= 1.0
@@ -91,3 +93,44 @@ def test_reading_again_leaves_the_counts_of_the_reading_before() -> None:
     next(again)
     assert made.progress == 1.0
     assert 1 + len(list(again)) == len(events)
+
+
+@pytest.mark.slow
+def test_images_that_come_again_with_another_stamp_are_no_shutter_and_no_turn(
+    recorded: tuple[CameraRecordingInfo, list[CameraEvent]],
+) -> None:
+    info, events = recorded
+    end_ns = max(event.time_ns for event in events if not isinstance(event, ImuSamples))
+
+    def twice() -> Iterator[CameraEvent]:
+        for event in events:
+            yield event
+            if not isinstance(event, ImuSamples):
+                yield dataclasses.replace(event, time_ns=event.time_ns + 40_000_000)
+
+    assert calibration_doubts(info, twice(), end_ns) == []
+    assert all("imu" not in said and "shutter" not in said for said in likely_causes(info, twice(), 1, None))
+
+
+@pytest.mark.parametrize("seconds", [0.1, 1.0])
+def test_an_imu_that_repeats_one_value_for_long_is_a_cause(
+    recorded: tuple[CameraRecordingInfo, list[CameraEvent]], seconds: float
+) -> None:
+    info, events = recorded
+    begin_ns = events[0].time_ns[0] + 3_000_000_000 if isinstance(events[0], ImuSamples) else events[0].time_ns + 3_000_000_000
+
+    def stuck() -> Iterator[CameraEvent]:
+        held = None
+        for event in events:
+            if isinstance(event, ImuSamples):
+                gyro = event.gyro.copy()
+                repeats = (event.time_ns >= begin_ns) & (event.time_ns < begin_ns + round(seconds * 1e9))
+                if repeats.any():
+                    held = gyro[repeats][0] if held is None else held
+                    gyro[repeats] = held
+                event = dataclasses.replace(event, gyro=gyro)
+            yield event
+
+    said = [cause for cause in likely_causes(info, stuck(), 1, None) if cause.startswith("imu_repeats")]
+    assert len(said) == (seconds > 0.2)
+    assert all("the gyroscope for 0.9" in cause or "the gyroscope for 1.0" in cause for cause in said)

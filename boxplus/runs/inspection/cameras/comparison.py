@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence
+from boxplus.runs.inspection.cameras.carried import Followed, check_carried
 from boxplus.runs.inspection.cameras.focal_length import check_focal_length
 from boxplus.runs.inspection.cameras.known_turns import known_turns
 from boxplus.runs.inspection.cameras.readout import check_readout
 from boxplus.runs.inspection.cameras.rotation import Turns, align, check_rotation
-from boxplus.runs.inspection.cameras.stereo import Corners, check_calibration
+from boxplus.runs.inspection.cameras.stereo import Corners, check_baseline, check_calibration
 from boxplus.runs.inspection.cameras.tracking import Turned, follow, rotation_between
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.sensors.imu import ImuSamples
@@ -25,6 +26,7 @@ from boxplus.sensors.imu import ImuSamples
 _STEREO_PAIRS = 12
 _MOST_TURNS = 240
 _APART = 3
+_SHOWN = 16  # grey values between the darkest and the brightest pixel of an image that shows something
 
 
 class Comparison:
@@ -42,8 +44,10 @@ class Comparison:
         self._pictures = list(pictures)
         self._every = max(1, images // _STEREO_PAIRS)
         self._seconds = 0  # images of the second camera so far
+        self._same = 0  # of the pairs that were compared
         self._last: tuple[int, NDArray[np.uint8]] | None = None
         self._corners = Corners()
+        self._followed: list[Followed] = []
         self.turns = Turns(images=deque(maxlen=_APART))
 
     def note(self, image: CameraImage, grey: NDArray[np.uint8]) -> None:
@@ -54,6 +58,7 @@ class Comparison:
         elif len(self._pictures) > 1 and image.camera == self._pictures[1].index:
             self._seconds += 1
             if self._seconds % self._every == 0 and self._last is not None and self._last[0] == image.time_ns:
+                self._same += bool(np.ptp(grey[::8, ::8]) > _SHOWN and np.array_equal(self._last[1], grey))
                 before, after = follow(self._last[1], grey)
                 self._corners.first.append(before)
                 self._corners.second.append(after)
@@ -63,19 +68,26 @@ class Comparison:
         model, turns = self._pictures[0].model, self.turns
         if model is None or turns.tried >= _MOST_TURNS:
             return
+        if turns.images and np.array_equal(turns.images[-1][1], grey):
+            return  # the image before with another stamp: no turn between them is one of the camera
         # Over a few images the turn is larger and its error the same.
         if len(turns.images) == _APART:
             before_ns, before = turns.images[0]
             turns.tried += 1
-            turned = rotation_between(model, before, grey)
+            corners = follow(before, grey)
+            self._followed.append(Followed(before_ns, time_ns, *corners))
+            turned = rotation_between(model, *corners)
             turns.followed.append(turned.followed if isinstance(turned, Turned) else turned)
             if isinstance(turned, Turned):
                 turns.add(before_ns, time_ns, turned.R_2_1, turned.before, turned.after)
         turns.images.append((time_ns, grey))
 
     def of_cameras(self) -> list[Evidence]:
-        """Whether the stereo calibration fits; nothing of one camera alone."""
-        return [check_calibration(self._pictures[:2], self._corners)] if len(self._pictures) > 1 else []
+        """Whether the stereo calibration fits, and its lengths are metres; nothing of one camera alone."""
+        if len(self._pictures) < 2:
+            return []
+        pair = self._pictures[:2]
+        return [*check_baseline(pair), check_calibration(pair, self._corners, self._same)]
 
     def with_imu(self, imu: ImuSamples) -> list[Evidence]:
         """Whether camera and IMU turn alike and as far, and whether all rows of an image do; nothing without a camera."""
@@ -84,6 +96,9 @@ class Comparison:
         camera = self._pictures[0]
         aligned = align(self.turns, imu)
         found = check_rotation(camera, aligned)
+        carried = check_carried(camera, self._followed, imu)
+        if carried:  # which explains why both turn unlike
+            return carried + [finding for finding in found if finding.value != "unlike"]
         if isinstance(aligned, str) or camera.model is None or any(e.value == "unlike" for e in found):
             return found
         if np.isfinite(aligned.offset_std_s):  # otherwise the clocks are so far apart that no turn is known

@@ -30,6 +30,13 @@ _OFFSET_S = 0.005
 _ANGLE_DEG = 1.5
 _UNLIKE, _FAR_OFF = 0.5, 3.0
 _HALF_TURN_DEG = 170.0
+_HALF_TURN_OFF_DEG = 5.0  # that a principal point beside the centre, turned with the image, puts one off
+_IMAGES = {
+    "images turned upside down": (-1.0, -1.0, 1.0),
+    "images mirrored left to right": (1.0, -1.0, -1.0),
+    "images mirrored top to bottom": (-1.0, 1.0, -1.0),
+}
+"""What looks like a half turn of the camera: a mirrored world turns backwards about the axes that lie in the mirror."""
 _COARSE = 5  # of the offsets looked at for another reading of the gyroscope
 _READINGS = {
     "the gyroscope's rates have the opposite sign, or it counts in a left-handed frame": -1.0,
@@ -218,9 +225,7 @@ def check_rotation(camera: CameraStream, found: Alignment | str) -> list[Evidenc
     if stated is None:
         text = f"the mounting is not known; the rotations suggest {rotvec}"
         return [*evidence, Evidence(rotation_key, "estimated", "ok", text)]
-    apart, inverted = (
-        float(np.degrees(Rotation.from_matrix(R.T @ found.R_imu_camera).magnitude())) for R in (stated[:3, :3], stated[:3, :3].T)
-    )
+    apart, inverted = (_degrees(R, found.R_imu_camera) for R in (stated[:3, :3], stated[:3, :3].T))
     verdict: Verdict = "ok"
     std = float(np.degrees(found.rotation_std))
     text = (
@@ -231,5 +236,13 @@ def check_rotation(camera: CameraStream, found: Alignment | str) -> list[Evidenc
         fits = inverted < _ANGLE_DEG < apart
         text += ": the inverse of what is stated fits" if fits else ": the stated mounting does not fit this recording"
         if apart > _HALF_TURN_DEG:
+            for what, axes in _IMAGES.items():
+                if _degrees(stated[:3, :3] @ np.diag(axes), found.R_imu_camera) < max(_HALF_TURN_OFF_DEG, 4.0 * std):
+                    text += f"; with {what} it would"
             text += ", or the gyroscope's rates have the opposite sign: with hardly a turn about one axis both look alike"
     return [*evidence, Evidence(rotation_key, f"{apart:.2f} deg apart", verdict, text)]
+
+
+def _degrees(R_a: NDArray[np.float64], R_b: NDArray[np.float64]) -> float:
+    """The angle between two rotations."""
+    return float(np.degrees(Rotation.from_matrix(R_a.T @ R_b).magnitude()))

@@ -15,9 +15,16 @@ Floats = NDArray[np.float64]
 
 _FEWEST = 50
 _EPIPOLAR_PX = 1.5
-_FITS_SHARE = 0.5
+_FITS_SHARE, _FITS_PX = 0.5, 0.3
+_IMAGES = {
+    "turned upside down": (True, True),
+    "mirrored left to right": (True, False),
+    "mirrored top to bottom": (False, True),
+}
+"""What may have been done to images of both cameras: whether u, and v, count from the other end."""
 _PARALLAX_PX = 2.0
 _MOST_BEHIND = 0.5
+_FARTHEST_M = 10.0
 
 
 @dataclass(slots=True)
@@ -67,10 +74,29 @@ class _Fit:
         return self.median_px <= _EPIPOLAR_PX and self.behind <= _MOST_BEHIND
 
 
-def check_calibration(pair: list[CameraStream], corners: Corners) -> Evidence:
-    """Whether the stereo calibration fits the images: epipolar lines, and points before the cameras."""
+def check_baseline(pair: list[CameraStream]) -> list[Evidence]:
+    """A finding where two cameras are stated farther apart than any rig has them: no epipolar line shows a wrong unit."""
+    one, two = pair[0].T_body_camera, pair[1].T_body_camera
+    if one is None or two is None:
+        return []
+    apart = float(np.linalg.norm(two[:3, 3] - one[:3, 3]))
+    if apart <= _FARTHEST_M:
+        return []
+    text = f"between {pair[0].name} and {pair[1].name} by their mountings: translations are metres; are these millimetres?"
+    return [Evidence(f"{pair[0].name}_{pair[1].name}_baseline", f"{apart:.1f} m", "warning", text)]
+
+
+def check_calibration(pair: list[CameraStream], corners: Corners, same: int = 0) -> Evidence:
+    """Whether the stereo calibration fits the images: epipolar lines, and points before the cameras.
+
+    Args:
+        same: pairs of images that were the same to the bit.
+    """
     key = f"{pair[0].name}_{pair[1].name}_epipolar"
     first, second = corners.joined()
+    if same:
+        text = f"{same} pairs of images of both cameras are the same to the bit: one camera is recorded in the place of the other"
+        return Evidence(key, "one camera", "error", text)
     stated = _fit(pair[0], pair[1], first, second)
     if stated is None:
         text = f"{len(first)} corners of pairs of one instant, with calibration: too few to check the stereo calibration"
@@ -82,15 +108,30 @@ def check_calibration(pair: list[CameraStream], corners: Corners) -> Evidence:
     if stated.median_px <= _EPIPOLAR_PX:
         text += f"; but {100 * stated.behind:.0f} % of the points would lie behind the cameras"
     text += ": the stereo calibration does not fit these images"
-    causes = {
-        "with the calibrations swapped it fits, so the cameras are swapped": (pair[1], pair[0]),
-        "with the inverse of both mountings it fits": (_inverted(pair[0]), _inverted(pair[1])),
+    readings: dict[str, tuple[CameraStream, CameraStream, Floats, Floats]] = {
+        "with the calibrations swapped it fits, so the cameras are swapped": (pair[1], pair[0], first, second),
+        "with the inverse of both mountings it fits": (_inverted(pair[0]), _inverted(pair[1]), first, second),
     }
-    for cause, (one, other) in causes.items():
-        fit = _fit(one, other, first, second)
-        if fit is not None and fit.good and fit.median_px <= max(_FITS_SHARE * stated.median_px, 0.3):
-            return Evidence(key, value, "error", f"{text}: {cause} ({fit.median_px:.2f} px)")
+    for what, axes in _IMAGES.items():
+        turned_1, turned_2 = (_mirrored(camera, seen, axes) for camera, seen in zip(pair, (first, second), strict=True))
+        readings[f"with both images {what} it fits"] = pair[0], pair[1], turned_1, turned_2
+    best: tuple[float, str] | None = None
+    for cause, reading in readings.items():
+        fit = _fit(*reading)
+        if fit is not None and fit.good and fit.median_px <= max(_FITS_SHARE * stated.median_px, _FITS_PX):
+            # Of those that fit as well as corners are known the first one is likeliest: swapped cameras look like a mirror.
+            rank = max(fit.median_px, _FITS_PX)
+            if best is None or rank < best[0]:
+                best = rank, f"{cause} ({fit.median_px:.2f} px)"
+    if best is not None:
+        return Evidence(key, value, "error", f"{text}: {best[1]}")
     return Evidence(key, value, "error", f"{text}; swapping or inverting does not mend it: another rig, or one that has moved?")
+
+
+def _mirrored(camera: CameraStream, pixels: Floats, axes: tuple[bool, bool]) -> Floats:
+    """Pixels (N, 2) with u, v or both counted from the other end."""
+    last = np.array([camera.width, camera.height]) - 1.0
+    return np.where(axes, last - pixels, pixels)
 
 
 def _inverted(camera: CameraStream) -> CameraStream:

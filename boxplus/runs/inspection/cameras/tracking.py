@@ -46,10 +46,9 @@ def follow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[NDArray
     return corners.reshape(-1, 2)[kept].astype(np.float64), there.reshape(-1, 2)[kept].astype(np.float64)
 
 
-def rotation_between(model: CameraModel, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Turned | int:
-    """The rotation between two images, from the essential matrix; where too few corners agree on one, how many were followed."""
-    cv2 = require("cv2", "which follows corners")
-    before, after = follow(first, second)
+def rotation_between(model: CameraModel, before: NDArray[np.float64], after: NDArray[np.float64]) -> Turned | int:
+    """The rotation between two images by pixels (N, 2) of corners in both; where too few agree on one, how many there are."""
+    cv2 = require("cv2", "which finds the essential matrix")
     rays_1, found_1 = model.unproject(before)
     rays_2, found_2 = model.unproject(after)
     found = found_1 & found_2

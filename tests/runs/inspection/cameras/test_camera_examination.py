@@ -114,9 +114,21 @@ def test_rates_of_the_opposite_sign_about_two_axes_look_like_half_a_turn_of_the_
     planar = Turns(turns.begin_ns, turns.end_ns, [np.array([r[0], r[1], 0.01 * r[2]]) for r in turns.rotation])
     opposite = ImuSamples(imu.time_ns, -imu.gyro * [1.0, 1.0, 0.01], imu.accel)
     (_, found) = check_rotation(stream(np.eye(3)), align(planar, opposite))
-    assert (
-        found.verdict == "error" and "does not fit this recording, or the gyroscope's rates have the opposite sign" in found.text
-    )
+    assert found.verdict == "error" and "does not fit this recording; with images turned upside down it would" in found.text
+    assert "or the gyroscope's rates have the opposite sign" in found.text
+
+
+@pytest.mark.parametrize(
+    ("what", "axes"),
+    [("turned upside down", (-1, -1, 1)), ("mirrored left to right", (1, -1, -1)), ("mirrored top to bottom", (-1, 1, -1))],
+)
+def test_images_that_were_turned_or_mirrored_are_told_by_how_they_turn(what: str, axes: tuple[int, int, int]) -> None:
+    """A mirror M takes a rotation vector w to -M w, and half a turn about the optical axis is one."""
+    turns, imu = turning(1, 0.0, np.eye(3))
+    seen = Turns(turns.begin_ns, turns.end_ns, [np.array(axes) * r for r in turns.rotation])
+    (_, found) = check_rotation(stream(np.eye(3)), align(seen, imu))
+    assert found.verdict == "error" and f"with images {what} it would" in found.text
+    assert found.text.count(" it would") == 1
 
 
 def test_what_the_motion_does_not_show_is_not_judged() -> None:
