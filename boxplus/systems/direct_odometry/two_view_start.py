@@ -137,7 +137,7 @@ class TwoViewStart:
         if left < _LEAST_PARALLAX * size:
             self.problem = (
                 f"corners moved by {moved:.1f} pixels, of which a rotation leaves {left:.1f} ({_LEAST_PARALLAX * size:.1f} are "
-                "needed): the camera has to move sideways, not only to turn"
+                "needed): the camera only turns or stands, or what it sees is too far away for its way"
             )
             return None
         motion = _essential(m1, m2, f, left)
