@@ -64,3 +64,31 @@ def test_a_steady_turn_in_coarse_steps_is_no_limit(step: float, seed: int) -> No
     z = np.round((smooth + 0.1 * step * random.normal(size=1200)) / step) * step
     assert np.count_nonzero(z == z.max()) > 20
     assert not told(z)
+
+
+def saturated_gyroscope(rate_hz: int, step: float, bias: float) -> tuple[list[float], NDArray[np.float64]]:
+    """Times [s] at which scans of 0.1 s were told to be saturated, of a swing to 6 rad/s beyond 16 bits; and the rates (N,)."""
+    random, count = np.random.default_rng(rate_hz), 10 * rate_hz
+    time_ns = np.arange(count) * (1_000_000_000 // rate_hz)
+    gyro = 2e-3 * random.normal(size=(count, 3))
+    gyro[:, 2] += 6.0 * np.sin(np.pi * time_ns * 1e-9)
+    gyro = np.clip(np.round(gyro / step), -(2**15), 2**15 - 1) * step - bias
+    accel = 0.02 * random.normal(size=(count, 3)) + [0.0, 0.0, 9.81]
+    saturation, when = Saturation(), []
+    for begin in range(0, count - 1, rate_hz // 10):
+        part = slice(begin, begin + rate_hz // 10 + 1)
+        if saturation.update(ImuSamples(time_ns[part], gyro[part], accel[part])):
+            when.append(float(time_ns[begin]) * 1e-9)
+    return when, gyro[:, 2]
+
+
+@pytest.mark.parametrize("rate_hz", [50, 100, 200, 400, 1000])
+@pytest.mark.parametrize("bias", [0.0, 0.03])
+def test_a_limit_either_way_is_told_amid_a_motion_that_is_never_slow(rate_hz: int, bias: float) -> None:
+    """Swinging from the first sample on, the axis itself never changes by a single step, nor is it as far up as down."""
+    when, rates = saturated_gyroscope(rate_hz, 4.3633 / 2**15, bias)
+    at_limit = (np.isclose(rates, rates.min()) | np.isclose(rates, rates.max())).reshape(-1, rate_hz // 10)
+    clipped = np.flatnonzero(at_limit.all(axis=1)) * 0.1
+    assert len(clipped) > 30 and np.isclose(clipped[:, None], when).any(axis=1).mean() > 0.95
+    clear = np.flatnonzero(~at_limit.any(axis=1)) * 0.1
+    assert not np.isclose(clear[:, None], when).any()
