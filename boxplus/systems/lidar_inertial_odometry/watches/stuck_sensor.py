@@ -31,13 +31,15 @@ class StuckSensor:
     def __init__(self) -> None:
         self._time_ns, self._values = np.zeros(0, dtype=np.int64), np.zeros((0, 6))
         self._turns: deque[tuple[int, NDArray[np.float64]]] = deque()  # since the gyroscope repeats itself, by the scans
+        self._bias = np.zeros(3)  # of the gyroscope, when it began to: one that is stuck drags its bias along
 
-    def update(self, imu: ImuSamples, turned: NDArray[np.float64]) -> str | None:
+    def update(self, imu: ImuSamples, turned: NDArray[np.float64], bias: NDArray[np.float64]) -> str | None:
         """Take one scan in; a sentence where one of the sensors is stuck.
 
         Args:
             imu: its samples.
             turned: (3,) rotation of the IMU over it, as the scan shows it [rad].
+            bias: (3,) of the gyroscope, as it was known before the scan [rad/s].
         """
         new = imu.time_ns > (self._time_ns[-1] if len(self._time_ns) else np.iinfo(np.int64).min)  # scans share some
         if not new.any():
@@ -50,7 +52,7 @@ class StuckSensor:
         self._time_ns, self._values = time_ns[max(first, 0) :], values[max(first, 0) :]
         if self._stopped():
             return self._sentence("gyroscope", "and went there from a turn within one of them")
-        if self._turns_alone(imu, turned):
+        if self._turns_alone(imu, turned, bias):
             return self._sentence("gyroscope", "although the scans turn")
         return self._sentence("accelerometer", "although the platform turns to and fro") if self._feels_nothing() else None
 
@@ -64,13 +66,16 @@ class StuckSensor:
         seconds = max(float(self._time_ns[begin] - self._time_ns[begin - 1]) * 1e-9, self._seconds_a_sample())
         return bool(steps.min() > _MOST_RAD_S2 * seconds)
 
-    def _turns_alone(self, imu: ImuSamples, turned: NDArray[np.float64]) -> bool:
+    def _turns_alone(self, imu: ImuSamples, turned: NDArray[np.float64], bias: NDArray[np.float64]) -> bool:
         """Whether the scans turn and turn while the gyroscope repeats itself."""
         if self._stuck_since(_GYRO, _ACCEL, _ACCEL_NOISE) is None:
             self._turns.clear()
             return False
+        if not self._turns:
+            self._bias = bias.copy()
         end_ns = int(imu.time_ns[-1])
-        self._turns.append((end_ns, turned - self._values[-1, _GYRO] * float(end_ns - imu.time_ns[0]) * 1e-9))
+        claimed = (self._values[-1, _GYRO] - self._bias) * float(end_ns - imu.time_ns[0]) * 1e-9
+        self._turns.append((end_ns, turned - claimed))
         while end_ns - self._turns[0][0] > _WHILE_S * 1e9:
             self._turns.popleft()
         ways = np.cumsum([turn for _, turn in self._turns], axis=0)

@@ -28,12 +28,15 @@ def told(
     scan_s: float = 0.1,
     burst: int = 1,
     rates: np.ndarray | None = None,
+    bias: np.ndarray | None = None,
 ) -> list[tuple[float, str]]:
     """When [s] something was said of samples (N, 3), pushed scan by scan with one shared at every border, and what.
 
     Args:
         rates: (N, 3) at which the scans turn, if not as the gyroscope says [rad/s].
+        bias: (3,) of the gyroscope, as it is known [rad/s]; None: none.
     """
+    bias = np.zeros(3) if bias is None else bias
     rates = gyro if rates is None else rates
     watch, said = StuckSensor(), []
     time_ns = np.arange(len(gyro)) * (1_000_000_000 // rate_hz)
@@ -42,7 +45,7 @@ def told(
     for begin in range(0, len(gyro) - step, step):
         part = slice(begin, begin + step + 1)
         turned = rates[begin : begin + step].sum(axis=0) / rate_hz
-        text = watch.update(ImuSamples.from_arrays(time_ns[part], gyro[part], accel[part]), turned)
+        text = watch.update(ImuSamples.from_arrays(time_ns[part], gyro[part], accel[part]), turned, bias)
         if text is not None:
             said.append((float(time_ns[part][-1]) * 1e-9, text))
     return said
@@ -103,6 +106,17 @@ def test_turns_below_the_steps_of_a_coarse_gyroscope_are_nothing(step: float, sc
     slow = 0.99 * step * np.tile([0.0, 0.6, 0.8], (4000, 1))
     noise = np.repeat(random.normal(size=(400, 3)), 10, axis=0) * np.deg2rad(0.1) / 0.05  # of the scans' turns
     assert not told(np.zeros_like(accel), accel, scan_s=scan_s, rates=slow + noise)
+
+
+@pytest.mark.parametrize("size", [0.02, 0.05, 0.1])
+def test_a_coarse_gyroscope_at_rest_may_have_a_large_bias(size: float) -> None:
+    random, bias = np.random.default_rng(0), size * np.array([0.0, 0.6, 0.8])
+    accel = np.tile([0.0, 0.0, 9.81], (2000, 1)) + 0.02 * random.normal(size=(2000, 3))
+    gyro = np.round((bias + 1e-4 * random.normal(size=accel.shape)) / 0.005) * 0.005
+    rest = np.zeros_like(gyro)
+    assert not told(gyro, accel, rates=rest, bias=bias)
+    turning = np.clip(np.arange(2000)[:, None] / RATE_HZ - 3.0, 0.0, 1.0) * [0.1, 0.0, 0.0]
+    assert told(gyro, accel, rates=turning, bias=bias)  # which it does not show
 
 
 @pytest.mark.parametrize("rate_hz", [50, 100, 200, 400])
