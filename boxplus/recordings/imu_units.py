@@ -6,7 +6,8 @@ Nothing that depends on the motion may overrule the definition: a multirotor's s
 body. Whether the definition holds, the LiDAR's rotation tells (docs/agreement.md).
 
 Some drivers deliver what is left without gravity. Of a lively motion that has a median of about 1 m/s², which looks like 1 g; but
-it is next to nothing ever again, which an accelerometer shows in free fall only.
+it is next to nothing ever again, which an accelerometer shows in free fall only, and cancels out within seconds. A robot that
+trots falls freely between its steps: what it feels does not cancel out.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ _PLAUSIBLE_NORMS: dict[AccelUnit, tuple[float, float]] = {"g": (0.6, 1.6), "m/s2
 _WEIGHTLESS = 0.52
 """Of the median: a tenth of the samples below it is free fall. In walks, drives and flights that tenth is below 0.67 and more,
 shaken by 5 m/s² rms along every axis below 0.55; without gravity below 0.1 in walks and drives, 0.5 where it is noise alone."""
+_PARTS, _CANCELLED = 4, 0.75
+"""Parts of the samples, and the length of their mean accelerations over the median length: below it they cancel out. In flights
+above 0.97, trotting above 0.8; flights without their gravity come to 0.14 to 0.63."""
 _FASTEST_RAD_S = 35.0
 """2000 °/s, the range of the fastest common gyroscopes."""
 
@@ -55,7 +59,7 @@ def read_accel_unit(accel: NDArray[np.float64], options: RecordingOptions) -> tu
             "say the unit with --accel-unit; if it already is m/s2 or g, gravity is missing from the data and boxplus needs it",
         )
     least = float(np.quantile(norms, 0.1))
-    if fitting[0] == "g" and least < _WEIGHTLESS * norm:
+    if fitting[0] == "g" and least < _WEIGHTLESS * norm and _mean_length(accel) < _CANCELLED * norm:
         raise AmbiguityError(
             "accelerations with gravity in them, which never come near zero but in free fall",
             f"a median |acceleration| of {norm:.3f}, as of an accelerometer in g, and a tenth of the samples below {least:.3f}, "
@@ -88,3 +92,11 @@ def _norms(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     with np.errstate(over="ignore"):
         norms: NDArray[np.float64] = np.linalg.norm(vectors, axis=1)
     return norms[np.isfinite(norms)]
+
+
+def _mean_length(accel: NDArray[np.float64]) -> float:
+    """Length of the mean of some seconds' accelerations, in the median of the parts of (N, 3)."""
+    with np.errstate(over="ignore"):
+        finite = accel[np.isfinite(np.linalg.norm(accel, axis=1))]
+    parts = np.array_split(finite, min(_PARTS, len(finite)))
+    return float(np.median([np.linalg.norm(part.mean(axis=0)) for part in parts]))

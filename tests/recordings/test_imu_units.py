@@ -80,3 +80,16 @@ def test_accelerations_without_gravity_are_not_taken_for_those_in_g(seed: int, s
     assert read_accel_unit(accel, RecordingOptions(accel_unit="g"))[0] == "g"
     # Shaken as hard, but with gravity.
     assert read_accel_unit(0.4 * accel / size + [0.0, 0.0, 1.0], FREE)[0] == "g"
+
+
+@given(seed=st.integers(0, 1000), aloft=st.floats(0.05, 0.3), steps_hz=st.floats(1.5, 4.0), turn=st.floats(-1.0, 1.0))
+def test_a_robot_that_trots_with_an_accelerometer_in_g_falls_freely_between_its_steps(
+    seed: int, aloft: float, steps_hz: float, turn: float
+) -> None:
+    time = np.arange(1200) / 200.0
+    phase = (time * steps_hz) % 1.0
+    stance = np.pi / 2.0 / (1.0 - aloft) * np.sin(np.pi * np.clip((phase - aloft) / (1.0 - aloft), 0.0, 1.0))
+    tilt = 0.2 * np.sin(turn * time)
+    accel = np.where(phase < aloft, 0.0, stance)[:, None] * np.stack([np.sin(tilt), 0.0 * tilt, np.cos(tilt)], axis=1)
+    accel += 0.05 * np.random.default_rng(seed).normal(size=accel.shape)
+    assert read_accel_unit(accel, FREE)[0] == "g"
