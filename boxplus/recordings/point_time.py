@@ -121,7 +121,7 @@ def read_point_time(
     Args:
         field: name of the time field, for the messages.
         clouds: the first clouds of the recording.
-        imu_delay_ns: median time between the stamp of an IMU message and its reception, or None when it is not known:
+        imu_delay_ns: time between the stamp of an IMU message and its reception, of the quickest, or None when it is not known:
             the yardstick that tells a delay of the LiDAR's messages from an offset of the clocks.
         options: what the user decided.
 
