@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 Transform = tuple[str, str, NDArray[np.float64]]
 
-_SAME_M, _SAME_DEG = 5e-3, 0.2  # between transforms that say the same: some are printed to two or three digits
+_SAME_M, _SAME_DEG = 1e-2, 0.6  # between transforms that say the same, one of them in metres and angles of two digits
 
 
 class Chain(NamedTuple):

@@ -70,3 +70,17 @@ def test_transforms_that_disagree_are_told_where_they_matter() -> None:
         assert found is not None and bool(found.disagreement) == said
     found = chain([*tree, ("a", "b", off)], "a", "b")
     assert found is not None and "0.300 m" in found.disagreement and "0.0 deg" in found.disagreement
+
+
+@given(seed=st.integers(0, 10_000))
+def test_a_transform_published_again_with_two_digits_says_the_same(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    p, angles = rng.uniform(-1.0, 1.0, 3), rng.uniform((-3.0, -0.3, -0.3), (3.0, 0.3, 0.3))
+    full, short = (
+        np.concatenate([p.round(digits), Rotation.from_euler("ZYX", angles.round(digits)).as_quat()]) for digits in (9, 2)
+    )
+    for edges in ([("base", "lidar", full), ("base", "lidar", short)], [("base", "lidar", short), ("base", "lidar", full)]):
+        found = chain(edges, "base", "lidar")
+        assert found is not None and not found.disagreement
+    found = chain([("base", "lidar", full), ("base", "lidar", short + np.array([0.02, 0, 0, 0, 0, 0, 0]))], "base", "lidar")
+    assert found is not None and found.disagreement
