@@ -109,10 +109,10 @@ class LidarOdometry(Snapshots):
         open_text = None
         if self._longest_weak_s > _LONGEST_WEAK_S:
             open_text = (
-                f"for {self._longest_weak_s:.1f} s the scans left a direction open, and without an IMU nothing else tells how "
-                "far the LiDAR went along it"
+                f"for {self._longest_weak_s:.1f} s, less half of the time between in which every direction seemed shown, the "
+                "scans left a direction open, and without an IMU nothing else tells how far the LiDAR went along it"
             )
-        return " ".join(filter(None, [self._gap, self._passing.contradiction, open_text])) or None
+        return "; ".join(filter(None, [self._gap, self._passing.contradiction, open_text])) or None
 
     @property
     def time_steps(self) -> list[str]:
@@ -159,7 +159,7 @@ class LidarOdometry(Snapshots):
             f"{why}: where the LiDAR went meanwhile is not known; a new start and a new map begin at the last position, and the "
             "poses before and after do not belong together"
         )
-        self._gap = text if self._gap is None else f"{self._gap} {text}"
+        self._gap = text if self._gap is None else f"{self._gap}; {text}"
         self.start, self._next_try, self._untaken = None, 0, 0
         self._last_position = self._state.p_world_lidar
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
