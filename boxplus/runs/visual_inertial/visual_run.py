@@ -256,8 +256,8 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         carried = self._rejected[CARRIED]
         if carried >= _CARRIED:
             text = (
-                f"{carried} corners stood still in the image while the camera turned: dirt on the lens, text in the image, or a "
-                "part of the platform in view; they were left out"
+                f"{carried} corners stood still in the image while the camera turned: dirt on the lens, text in the image, a "
+                "part of the platform in view, or the middle of a circle that it moved on; they were left out"
             )
             shared["warnings"].append(WarningFacts(text=text, count=carried))
         shared["warnings"] += [WarningFacts(text=doubt, count=1) for doubt in self._doubts]

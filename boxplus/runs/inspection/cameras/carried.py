@@ -55,6 +55,6 @@ def check_carried(camera: CameraStream, pairs: list[Followed], imu: ImuSamples) 
         return []
     text = (
         f"{still} of {asked} corners stand still in the image while the gyroscope turns the camera and others move: a part of "
-        "the platform is in view, dirt on the lens, or text in the image"
+        "the platform is in view, dirt on the lens, text in the image, or the middle of a circle that the camera moves on"
     )
     return [Evidence(f"{camera.name}_carried", f"{still / asked:.0%}", "warning", text)]

@@ -2,7 +2,8 @@
 
 They stand still in the image while the camera turns, and look like landmarks far away on a platform that does not turn. By the
 gyroscope a landmark moves, by the rotation alone, from pixel p to π(R m). For it to stay, a translation has to undo that, at its
-own depth and in every image: over a turn of some degrees nothing does so to a pixel but what is fixed to the camera.
+own depth and in every image. Over a turn of some degrees that happens on a circle around a landmark only, on which the camera
+looks at it all the time: what is within two hundredths of the radius from the middle of one that is flown well is let go too.
 """
 
 from __future__ import annotations
