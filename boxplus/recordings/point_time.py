@@ -6,6 +6,7 @@ unit; where the values lie relative to the message's stamp names the reference.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,6 +28,7 @@ _SAME_CLOCK_NS = 1_000_000_000
 _STAMPED = 1e-3  # of a scan's duration: received with its stamp, as far as a recorder tells them apart
 _A_SCAN = (0.9, 1.9)  # scans' durations after the stamp at which a message arrives whose stamp is the start
 _EARLY_NS = 10_000_000  # that an IMU message may take longer than a scan to arrive
+_QUICKEST = 0.05  # of the messages: where they arrive many at a time, all but the last have waited for it
 _AT_ONCE = 0.15  # of the points of a scan: no LiDAR that sweeps measures as many at one instant, of 16 columns each has 0.06
 
 
@@ -70,6 +72,11 @@ def times_of_cloud(
     different, count = np.unique(of_points, return_counts=True)
     most = int(count.argmax())
     return CloudTimes(stamp_ns, received_ns, low, high, float(count[most] / len(of_points)), different[most].item())
+
+
+def delay_ns(stamp_ns: Sequence[int], received_ns: Sequence[int]) -> float:
+    """Time from the stamps of messages (N,) to their reception [ns]: of those that have not waited for others to be sent on."""
+    return float(np.quantile(np.array(received_ns, np.int64) - np.array(stamp_ns, np.int64), _QUICKEST))
 
 
 def choose_time_field(fields: tuple[str, ...], candidates: tuple[str, ...], options: RecordingOptions) -> str | None:
@@ -242,7 +249,7 @@ def _read_reference(
 
 def _confirm_scan_start(clouds: list[CloudTimes], seconds: str, last_ns: float, imu_delay_ns: float | None) -> str:
     """Check positive times against reception: no message arrives before its last point was measured."""
-    delay = float(np.median([cloud.received_ns - cloud.stamp_ns for cloud in clouds]))
+    delay = delay_ns([cloud.stamp_ns for cloud in clouds], [cloud.received_ns for cloud in clouds])
     if abs(delay) < _STAMPED * last_ns:
         return f"the values run {seconds}, from the stamp; messages were recorded with their stamps, which confirms nothing"
     relative_delay = delay - (imu_delay_ns or 0.0)
@@ -272,7 +279,7 @@ def _doubt(clouds: list[CloudTimes], scale: int, imu_delay_ns: float | None) -> 
     platform was a scan ago.
     """
     span = float(np.median([cloud.high - cloud.low for cloud in clouds])) * scale
-    received = float(np.median([cloud.received_ns - cloud.stamp_ns for cloud in clouds]))
+    received = delay_ns([cloud.stamp_ns for cloud in clouds], [cloud.received_ns for cloud in clouds])
     delay = received - (imu_delay_ns or 0.0)
     if abs(received) < _STAMPED * span or not _A_SCAN[0] * span <= delay <= _A_SCAN[1] * span:
         return ""

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from boxplus.errors import AmbiguityError, RecordingError
 from boxplus.recordings.info import PointTimeReading
 from boxplus.recordings.options import RecordingOptions, TimeUnit
-from boxplus.recordings.point_time import UNIT_NS, absolute_times, choose_time_field, read_point_time, times_of_cloud
+from boxplus.recordings.point_time import UNIT_NS, absolute_times, choose_time_field, delay_ns, read_point_time, times_of_cloud
 
 START_NS = 1_700_000_000_000_000_000
 UNITS = st.sampled_from(list(UNIT_NS))
@@ -115,6 +115,26 @@ def test_a_reference_that_the_arrival_of_messages_contradicts_is_doubted(
     # Values that count up to the stamp say themselves that it is the end.
     clouds = clouds_of(lambda _: np.linspace(-0.1, 0.0, 50), 100_000_000, delay_ns=delay_ms * 1_000_000)
     assert read_point_time("time", clouds, imu_delay_ns, given)[1][1].verdict == "ok"
+
+
+@pytest.mark.parametrize("stamp_at_end", [False, True])
+def test_a_recorder_that_holds_all_messages_back_hides_no_stamp_at_the_end(stamp_at_end: bool) -> None:
+    """Half a second of them arrives at once: on average the LiDAR's are a quarter of a second late, and the IMU's as well."""
+    burst_ns, scan_ns, imu_ns = 500_000_000, 100_000_000, 5_000_000
+    stamps = [START_NS + 7_000_000 + k * scan_ns for k in range(30)]
+    over_ns = 3_000_000 if stamp_at_end else scan_ns + 3_000_000  # after the stamp
+
+    def received(ready_ns: int) -> int:
+        return -(-ready_ns // burst_ns) * burst_ns
+
+    clouds = [times_of_cloud(stamp, received(stamp + over_ns), np.linspace(0.0, 0.1, 50)) for stamp in stamps]
+    imu = [START_NS + k * imu_ns for k in range(600)]
+    imu_delay_ns = delay_ns(imu, [received(stamp + 1_000_000) for stamp in imu])
+    if stamp_at_end:
+        with pytest.raises(AmbiguityError, match="these are the end of the scan"):
+            read_point_time("time", clouds, imu_delay_ns, RecordingOptions())
+    else:
+        assert read_point_time("time", clouds, imu_delay_ns, RecordingOptions())[0].reference == "scan_start"
 
 
 def test_a_span_that_is_no_scan_is_refused_or_warned_about() -> None:

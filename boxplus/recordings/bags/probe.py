@@ -39,7 +39,6 @@ _PROBE_SCANS = 30
 _SAME_CLOCK_S = 2.0
 _MOST_TRANSFORM_MESSAGES = 1000
 _MOST_RENAMINGS = 2  # of a topic's frame
-_QUICKEST = 0.05  # of the IMU's messages: where they arrive many at a time, all but the last have waited for it
 
 
 @dataclass(slots=True)
@@ -97,7 +96,7 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
             "choose another --lidar-topic or convert the recording to sensor_msgs/PointCloud2",
         )
     _check_frames(lidar.topic, probe.frames)
-    lidar_delay = _delay_ns(lidar.topic, probe.stamp_ns, probe.received_ns, 0.5)
+    lidar_delay = _delay_ns(lidar.topic, probe.stamp_ns, probe.received_ns)
     delay: float | None = None
     if imu is not None:
         if not imu_probe.time_ns:
@@ -105,7 +104,7 @@ def find_out(path: Path, container: Container, options: RecordingOptions) -> Rec
                 f"IMU messages on {imu.topic}", "none that can be read in the first seconds", "choose another --imu-topic"
             )
         _check_frames(imu.topic, imu_probe.frames)
-        delay = _delay_ns(imu.topic, imu_probe.time_ns, imu_probe.received_ns, _QUICKEST)
+        delay = _delay_ns(imu.topic, imu_probe.time_ns, imu_probe.received_ns)
         evidence.append(_clocks(lidar_delay - delay))
     reading = PointTimeReading(None, "ns", "scan_start", "stamp")
     name = point_time.choose_time_field(probe.fields, probe.time_fields, options)
@@ -164,15 +163,15 @@ def _check_frames(topic: str, frames: list[str]) -> None:
         )
 
 
-def _delay_ns(topic: str, stamp_ns: list[int], received_ns: list[int], quantile: float) -> float:
-    """Time from stamp to reception, that quantile of it. Raises RecordingError when the stamps stand still."""
+def _delay_ns(topic: str, stamp_ns: list[int], received_ns: list[int]) -> float:
+    """Time from stamp to reception [ns]. Raises RecordingError when the stamps stand still."""
     if len(stamp_ns) >= 3 and min(stamp_ns) == max(stamp_ns):
         raise RecordingError(
             f"stamps on {topic} that go on from message to message",
             f"the same stamp {stamp_ns[0] * 1e-9:.3f} s on the first {len(stamp_ns)} messages",
             "let the driver fill in header.stamp; the times of reception are too rough to replace it",
         )
-    return float(np.quantile(np.array(received_ns, np.int64) - np.array(stamp_ns, np.int64), quantile))
+    return point_time.delay_ns(stamp_ns, received_ns)
 
 
 def _clocks(difference_ns: float) -> Evidence:
