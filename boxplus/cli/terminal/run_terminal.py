@@ -111,10 +111,11 @@ class RunTerminal(Terminal):
         for name, value in rows:
             table.add_row(name, Text(value))
         console.print(table)
-        for warning in summary.warnings[:_SHOWN_WARNINGS]:
+        untold = [warning for warning in summary.warnings if warning.text not in (doubt or "")]
+        for warning in untold[:_SHOWN_WARNINGS]:
             self.warn(warning.text + (f" ({warning.count} times)" if warning.count > 1 else ""))
-        if len(summary.warnings) > _SHOWN_WARNINGS:
-            self.alarms.print(f"… and {len(summary.warnings) - _SHOWN_WARNINGS} more warnings in run.json")
+        if len(untold) > _SHOWN_WARNINGS:
+            self.alarms.print(f"… and {len(untold) - _SHOWN_WARNINGS} more warnings in run.json")
         for text in warnings:
             self.warn(text)
         self.print_files(folder, files)

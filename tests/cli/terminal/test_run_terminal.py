@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from boxplus.cli.terminal.run_terminal import RunTerminal
-from boxplus.runs.run_facts import RunFacts
+from boxplus.runs.run_facts import RunFacts, WarningFacts
 from boxplus.runs.run_loop import Progress
 
 
@@ -50,10 +50,12 @@ def test_the_first_line_says_whether_a_result_is_to_be_trusted(doubt: str | None
     """
     terminal, shown, alarms = RunTerminal(), io.StringIO(), io.StringIO()
     terminal.console, terminal.alarms = Console(file=shown, width=140), Console(file=alarms, width=140)
+    warnings = [WarningFacts(text=text, count=1) for text in ("fixes jump", "something else")]
     summary = SimpleNamespace(
         state="finished", contradiction="of the odometry alone", status={}, estimates=(9, "scans"), start=None, path_length_m=1.0,
-        length_unit="m", duration_s=1.0, warnings=[], describe_progress=lambda: "finished: 9 scans",
+        length_unit="m", duration_s=1.0, warnings=warnings, describe_progress=lambda: "finished: 9 scans",
     )  # fmt: skip
     terminal.print_results(cast(RunFacts, summary), [], Path("out"), [], doubt=doubt)
     first, other = (shown, alarms) if doubt is None else (alarms, shown)
     assert first.getvalue().splitlines()[0] == said and "not to be trusted" not in other.getvalue()
+    assert alarms.getvalue().count("fixes jump") == 1 and "something else" in alarms.getvalue()  # nothing is said twice
