@@ -102,6 +102,6 @@ class Comparison:
         if isinstance(aligned, str) or camera.model is None or any(e.value == "unlike" for e in found):
             return found
         if np.isfinite(aligned.offset_std_s):  # otherwise the clocks are so far apart that no turn is known
-            turns = known_turns(camera, self.turns, imu, aligned)
-            found += [check_readout(camera, turns), check_focal_length(camera, turns)]
+            turns, *apart = (known_turns(camera, self.turns, imu, aligned, side) for side in (0.0, -1.0, 1.0))
+            found += [check_readout(camera, turns, apart), check_focal_length(camera, turns)]
         return found

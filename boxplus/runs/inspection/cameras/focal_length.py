@@ -42,9 +42,10 @@ def estimate_focal_length(camera: CameraStream, turns: Sequence[KnownTurn]) -> t
     pixels = np.concatenate([p for pair in pairs for p in (pair.pixels1, pair.pixels2)]) - centre
     ends = np.cumsum([len(pair.pixels1) for pair in pairs for _ in range(2)])[:-1]
     longer, costs = np.arange(_SHORTEST, _LONGEST + 0.5 * _STEP, _STEP), []
+    stated = np.array([camera.readout_s])
     for epsilon in longer:
         rays = np.split(model.bearings(centre + pixels / (1.0 + epsilon))[0], ends)
-        costs.append([pair.misfit(rays[2 * k], rays[2 * k + 1], camera.readout_s) for k, pair in enumerate(pairs)])
+        costs.append([float(pair.misfits(rays[2 * k], rays[2 * k + 1], stated)[0]) for k, pair in enumerate(pairs)])
     in_pixels = np.array(costs) * (1.0 + longer[:, None]) ** 2
     if (end := end_behind(longer, in_pixels)) is not None:
         return end, np.inf

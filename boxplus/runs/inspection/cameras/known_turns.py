@@ -56,28 +56,40 @@ class KnownTurn:
         corners = {name: getattr(self, name)[kept] for name in ("pixels1", "pixels2", "row1", "row2")}
         return replace(self, **corners)
 
-    def misfit(self, x1: Floats, x2: Floats, readout_s: float) -> float:
-        """Mean square distance of directions (N, 3) from the planes of the best translation, for this readout time."""
-        y1 = x1 + readout_s * self.row1[:, None] * np.cross(self.omega1, x1)
-        y2 = x2 + readout_s * self.row2[:, None] * np.cross(self.omega2, x2)
-        normals = np.cross(y2, y1 @ self.R_2_1.T)
-        smallest = float(np.linalg.eigvalsh(normals.T @ normals)[0])
-        return max(smallest, 0.0) / len(normals) + 1e-12
+    def misfits(self, x1: Floats, x2: Floats, readout_s: Floats) -> Floats:
+        """Mean square distance of directions (N, 3) from the planes of the best translation, for each readout time (V,) [s].
+
+        The normals of the planes are polynomials of the readout time, of the second degree: n_0 + T n_1 + T² n_2.
+        """
+        y1, by_row1 = x1 @ self.R_2_1.T, (self.row1[:, None] * np.cross(self.omega1, x1)) @ self.R_2_1.T
+        by_row2 = self.row2[:, None] * np.cross(self.omega2, x2)
+        n = np.stack([np.cross(x2, y1), np.cross(x2, by_row1) + np.cross(by_row2, y1), np.cross(by_row2, by_row1)])
+        powers = readout_s[:, None] ** np.arange(3)
+        moments = np.einsum("vi,vj,ijab->vab", powers, powers, np.einsum("ina,jnb->ijab", n, n, optimize=True), optimize=True)
+        smallest: Floats = np.linalg.eigvalsh(moments)[:, 0]
+        return np.maximum(smallest, 0.0) / len(x1) + 1e-12
 
 
-def known_turns(camera: CameraStream, turns: Turns, imu: ImuSamples, aligned: Alignment) -> list[KnownTurn]:
-    """Pairs of images with enough corners; none where there are too few pairs."""
+def known_turns(
+    camera: CameraStream, turns: Turns, imu: ImuSamples, aligned: Alignment, deviations: float = 0.0
+) -> list[KnownTurn]:
+    """Pairs of images with enough corners; none where there are too few pairs.
+
+    Args:
+        deviations: standard deviations by which the offset is another one, -1 to 1: the pairs are the same.
+    """
     if camera.model is None:
         return []
     order = np.concatenate([[True], np.diff(np.maximum.accumulate(imu.time_ns)) > 0])
     time_s = (imu.time_ns[order] - imu.time_ns[0]) * 1e-9
     gyro = (imu.gyro[order] - aligned.bias) @ aligned.R_imu_camera
     between = np.vstack([np.zeros((1, 3)), np.cumsum(0.5 * (gyro[1:] + gyro[:-1]) * np.diff(time_s)[:, None], axis=0)])
-    pairs = []
+    pairs, margin_s, shift_s = [], _MARGIN_S + aligned.offset_std_s, deviations * aligned.offset_std_s
     for begin_ns, end_ns, before, after in zip(turns.begin_ns, turns.end_ns, turns.before, turns.after, strict=True):
         begin, end = ((t - imu.time_ns[0]) * 1e-9 + aligned.offset_s for t in (begin_ns, end_ns))
-        if len(before) < _FEWEST_CORNERS or begin - _MARGIN_S < time_s[0] or end + _MARGIN_S > time_s[-1]:
+        if len(before) < _FEWEST_CORNERS or begin - margin_s < time_s[0] or end + margin_s > time_s[-1]:
             continue
+        begin, end = begin + shift_s, end + shift_s
         step = max(1, len(before) // _MOST_CORNERS)
         pairs.append(
             KnownTurn(
@@ -120,7 +132,7 @@ def best_of(values: Floats, costs: Floats, independent: float = 1.0) -> tuple[fl
         values: (V,) evenly spaced; costs: (V, P) misfits of every pair.
         independent: how many of the corners of a pair err each by itself.
     """
-    costs = _weighed(costs)
+    costs = weighed(costs)
     total = costs.sum(axis=1)
     best, step = int(np.argmin(total)), float(values[1] - values[0])
     if not 0 < best < len(values) - 1:
@@ -129,9 +141,9 @@ def best_of(values: Floats, costs: Floats, independent: float = 1.0) -> tuple[fl
     if not curvature > 0.0:
         return None
     # How far the optimum moves when a part of the pairs is left out says how well it is known, whatever their errors are.
-    parts = [_optimum(values, costs[:, k::_PARTS].sum(axis=1)) for k in range(_PARTS)]
+    parts = [optimum(values, costs[:, k::_PARTS].sum(axis=1)) for k in range(_PARTS)]
     std = float(1.4826 * np.median(np.abs(np.array(parts) - np.median(parts)))) / np.sqrt(_PARTS)
-    return _optimum(values, total), max(std, float(np.sqrt(2.0 / (independent * curvature))) * step)
+    return optimum(values, total), max(std, float(np.sqrt(2.0 / (independent * curvature))) * step)
 
 
 def end_behind(values: Floats, costs: Floats) -> float | None:
@@ -139,7 +151,7 @@ def end_behind(values: Floats, costs: Floats) -> float | None:
 
     Every part of the pairs has to say so by itself, and all of them far more than noise explains that 0 does not fit.
     """
-    costs = _weighed(costs)
+    costs = weighed(costs)
     total = costs.sum(axis=1)
     end = float(values[np.argmin(total)])
     if end not in (values[0], values[-1]) or total[np.argmin(np.abs(values))] - total.min() < _SURE**2:
@@ -148,14 +160,14 @@ def end_behind(values: Floats, costs: Floats) -> float | None:
     return end if min(parts) > 0.5 else None
 
 
-def _weighed(costs: Floats) -> Floats:
+def weighed(costs: Floats) -> Floats:
     """Costs (V, P) by what is left of each pair at its best, so that none with a wrong corner outvotes the others."""
     least = costs.min(axis=0)
     weighed: Floats = costs / np.maximum(least, np.median(least))
     return weighed
 
 
-def _optimum(values: Floats, total: Floats) -> float:
+def optimum(values: Floats, total: Floats) -> float:
     best, step = int(np.clip(np.argmin(total), 1, len(values) - 2)), float(values[1] - values[0])
     curvature = total[best - 1] - 2.0 * total[best] + total[best + 1]
     return float(values[best] + 0.5 * step * (total[best - 1] - total[best + 1]) / max(curvature, 1e-30))

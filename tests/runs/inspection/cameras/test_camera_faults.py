@@ -9,13 +9,16 @@ from collections import deque
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from boxplus.manifolds import so3
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence
 from boxplus.runs.inspection.cameras.comparison import Comparison
 from boxplus.runs.inspection.cameras.examination import examine_cameras
 from boxplus.runs.inspection.cameras.focal_length import check_focal_length, estimate_focal_length
-from boxplus.runs.inspection.cameras.known_turns import known_turns
+from boxplus.runs.inspection.cameras.known_turns import KnownTurn, known_turns
 from boxplus.runs.inspection.cameras.readout import check_readout, estimate_readout
 from boxplus.runs.inspection.cameras.rotation import Turns, align
 from boxplus.runs.inspection.cameras.stereo import Corners, check_calibration
@@ -102,6 +105,39 @@ def test_the_time_from_row_to_row_comes_back(seed: int, readout_s: float) -> Non
     assert said.verdict == "warning" and "check line_delay" in said.text
     few = dataclasses.replace(camera, model=None)
     assert known_turns(few, turns, imu, aligned) == [] and check_readout(few, []).value == "unchecked"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "readout_s"), [(1, 0.0), (7, -0.02)])
+def test_an_offset_of_the_clocks_that_is_hardly_known_is_no_rolling_shutter(seed: int, readout_s: float) -> None:
+    """A sound drone that turned little was said to have one of 12 ms: its offset was 19 ± 12 ms."""
+    simulation, turns, imu = turning(seed, readout_s)
+    camera = streams(simulation.scenario.rig)[0]
+    aligned = align(turns, imu)
+    assert not isinstance(aligned, str)
+    vague = dataclasses.replace(aligned, offset_s=aligned.offset_s + 0.015, offset_std_s=0.012)
+    known, *apart = (known_turns(camera, turns, imu, vague, side) for side in (0.0, -1.0, 1.0))
+    assert len(known) == len(apart[0]) == len(apart[1])
+    pulled, found = estimate_readout(camera, known), estimate_readout(camera, known, apart)
+    assert pulled is not None and found is not None
+    assert abs(pulled.time_s - readout_s) > 2.0 * pulled.std_s
+    assert abs(found.time_s - readout_s) < 4.0 * found.std_s + 1e-3
+    assert abs(found.time_s - readout_s) < 0.5 * abs(pulled.time_s - readout_s)
+    assert (check_readout(camera, known, apart).verdict == "warning") == (readout_s != 0.0)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_misfits_are_those_of_directions_turned_one_by_one(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    x1, x2 = random.normal((0.0, 0.0, 1.0), 0.3, (2, 50, 3))
+    row1, row2 = random.uniform(-0.5, 0.5, (2, 50))
+    omega1, omega2 = random.normal(0.0, 1.0, (2, 3))
+    turn = KnownTurn(x1[:, :2], x2[:, :2], row1, row2, omega1, omega2, so3.exp(random.normal(0.0, 0.1, 3)))
+    times = random.uniform(-0.04, 0.04, 7)
+    for time, misfit in zip(times, turn.misfits(x1, x2, times), strict=True):
+        y1, y2 = (x + time * row[:, None] * np.cross(omega, x) for x, row, omega in ((x1, row1, omega1), (x2, row2, omega2)))
+        distances = np.linalg.svd(np.cross(y2, y1 @ turn.R_2_1.T), compute_uv=False)
+        assert misfit == pytest.approx(distances[-1] ** 2 / 50, rel=1e-6, abs=2e-12)
 
 
 @pytest.mark.slow
