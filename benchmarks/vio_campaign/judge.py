@@ -26,7 +26,7 @@ from vio_campaign.draws import Draw
 
 FLOOR_M, SHARE_OF_WAY = 0.05, 0.02
 MANY_NOT_OK = 0.3
-_WEAK = re.compile(r"frames are weak")
+_WEAK = re.compile(r"frames are weak|frames that were read have no pose")
 
 
 @dataclass

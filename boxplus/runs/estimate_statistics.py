@@ -10,6 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._words import either
 from boxplus.runs.run_facts import Distribution, Gap, WarningFacts, WeakInterval
 from boxplus.sensors.imu_values import BEYOND, EMPTY, GLITCH, NOT_FINITE
 
@@ -159,6 +160,28 @@ class EstimateStatistics:
                 text = f"{count} of {self.count} {self.unit} are {status}; the longest stretch, from {when}, {longest.text}"
                 found.append(WarningFacts(text=text, count=1, first_s=intervals[0].begin_s))
         return found
+
+    def told_of_late_start(
+        self, unstarted: int, read: int, first_read_ns: int | None, late_s: float, advice: str, refusal: str | None
+    ) -> list[WarningFacts]:
+        """A warning where the path begins later than what was read, by more than `late_s` [s].
+
+        Args:
+            unstarted: scans or frames that were left without a pose, as no start could be found that early.
+            read: how many there were; the first one was at first_read_ns.
+            advice: what lets a start be found sooner.
+            refusal: why the last of them was none, a sentence.
+        """
+        if not unstarted or self.first_time_ns is None or first_read_ns is None:
+            return []
+        after_s = (self.first_time_ns - first_read_ns) * 1e-9
+        if after_s <= late_s:
+            return []
+        text = (
+            f"{unstarted} of the {read} {self.unit} that were read {either(unstarted, 'has', 'have')} no pose: no start was "
+            f"found sooner, path and map begin {after_s:.1f} s after the first {self.unit.removesuffix('s')}; {advice}"
+        )
+        return [WarningFacts(text=text + (f". Just before: {refusal}" if refusal else ""), count=1)]
 
     def imu_warnings(self, counters: Mapping[str, int]) -> list[WarningFacts]:
         """A warning for each kind of samples that no sensor in order delivers.

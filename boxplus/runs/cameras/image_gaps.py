@@ -26,6 +26,11 @@ class ImageGaps:
         if not self._times_ns or time_ns > self._times_ns[-1]:
             self._times_ns.append(time_ns)
 
+    @property
+    def first_ns(self) -> int | None:
+        """The time of the first image [ns]; None before there was one."""
+        return self._times_ns[0] if self._times_ns else None
+
     def gaps(self, origin_ns: int) -> list[Gap]:
         """In order of time: a quarter of a second and three times the usual interval on both sides, or longer."""
         times_ns = np.array(self._times_ns, np.int64)

@@ -103,19 +103,9 @@ class RunStatistics(EstimateStatistics):
             unstarted: scans that were left without a pose, as no start could be found that early.
             refusal: why the last of them was none, a sentence.
         """
-        if not unstarted or self.first_time_ns is None or self._first_scan_ns is None:
-            return []
-        late_s = (self.first_time_ns - self._first_scan_ns) * 1e-9
-        if late_s <= _LATE_S:
-            return []
-        text = (
-            f"{unstarted} of the {self.scans_read} scans that were read {either(unstarted, 'has', 'have')} no pose: no start was "
-            f"found sooner, path and map begin {late_s:.1f} s after the first scan; let a recording start at rest, or where "
-            "walls are near"
-        )
-        if refusal:
-            text += f". Just before: {refusal.removesuffix(WAITING)}"
-        return [WarningFacts(text=text, count=1)]
+        advice = "let a recording start at rest, or where walls are near"
+        refusal = refusal and refusal.removesuffix(WAITING)
+        return self.told_of_late_start(unstarted, self.scans_read, self._first_scan_ns, _LATE_S, advice, refusal)
 
     def repeated_warnings(self, repeated: int) -> list[WarningFacts]:
         """A warning where scans came again with new stamps."""

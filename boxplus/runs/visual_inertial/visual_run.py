@@ -43,10 +43,12 @@ _TOLD = {
 }  # of the tests of a start; `run.json` has all of them
 _OWN_STATE = (
     "_images", "_rejected", "_lines_rejected", "_keyframes", "_before_start", "_mountings", "_time_offset_s",
-    "_troubled_ns", "_turning", "_image_gaps",
+    "_troubled_ns", "_turning", "_image_gaps", "_refusal",
 )  # fmt: skip
 _MUCH_LOST = 0.15  # share of the frames
 _CARRIED = 10  # corners that moved along with the camera, which are no accident
+_LATE_S = 5.0  # one camera that moves from the first image on finds its start within four seconds
+_EARLIER = "let a recording start at rest, or with a motion that changes, in view of corners at all distances"
 _VAGUE_M = 0.5  # standard deviation of the distance beyond which a landmark does not enter the map
 
 
@@ -133,6 +135,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         self._mountings = np.array([camera.T_imu_camera for camera in self._rig.cameras])
         self._time_offset_s = 0.0
         self._troubled_ns: int | None = None
+        self._refusal: str | None = None  # why the last frame without a start gave none
         self._causes: list[str] = []
         self._doubts: list[str] = []
         self._turning, self._image_gaps = Turning(BEFORE_S), ImageGaps()
@@ -212,6 +215,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
             self._view.show(estimate)
         if estimate.status == "starting":
             self._before_start += 1
+            self._refusal = estimate.reasons[0]
             return
         began = time.perf_counter()
         T, covariance = estimate.T_world_imu, estimate.covariance[:6, :6]
@@ -249,6 +253,9 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         shared = self.shared_facts(state, error, with_imu=True)
         shared["warnings"] += self._gap_warnings()
         shared["warnings"] += counts.imu_warnings(self._odometry.counters)
+        shared["warnings"] += counts.told_of_late_start(
+            self._before_start, self._images[0], self._image_gaps.first_ns, _LATE_S, _EARLIER, self._refusal
+        )
         repeated = self._odometry.counters.get(REPEATED, 0)
         if repeated:
             text = f"{repeated} {REPEATED}: a driver or the recording delivers images again with new stamps; they are left out"

@@ -38,7 +38,7 @@ from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
 from boxplus.sensors.camera_image import CameraImage
 from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, make_rig, simulate_cameras, write_camera_recording
-from boxplus.simulation.cameras.faults import CameraFault
+from boxplus.simulation.cameras.faults import CameraFault, covered_lens
 from boxplus.systems.visual_inertial_odometry import VioConfig, VioEstimate
 from boxplus.systems.visual_inertial_odometry.corners.carried import CARRIED
 from tests.report.unpacked import figures_of
@@ -278,6 +278,22 @@ def test_no_start_in_the_whole_recording_is_an_error_with_its_number(tmp_path: P
         run_visual_odometry(as_camera_recording(simulation), tmp_path / "out", CONFIG)
     summary = read_vio_summary(tmp_path / "out" / "run.json")
     assert summary.state == "failed" and summary.start is None and summary.frames_before_start > 5
+
+
+@pytest.mark.parametrize("covered_s", [0.0, 5.0])
+def test_frames_without_a_pose_are_told_where_the_start_comes_late(tmp_path: Path, covered_s: float) -> None:
+    """Of 200 frames 114 had no pose, of which nothing but their number was said."""
+    simulation = simulate_cameras("room_moving", 4, duration_s=7.5, rig=make_rig("stereo", None, 0.25, 8.0))
+    with as_camera_recording(simulation, covered_lens(0, 0.0, covered_s)) as recording:
+        summary = run_visual_odometry(recording, tmp_path / "out", CONFIG)
+    said = [warning.text for warning in summary.warnings if "no pose" in warning.text]
+    assert summary.frames > 0 and len(said) == (covered_s > 0.0)
+    if said:
+        late_s = ((summary.first_time_ns or 0) - simulation.stamp_ns(0)) * 1e-9
+        begin = f"{summary.frames_before_start} of the {summary.cameras[0].images} frames that were read have no pose: no start "
+        assert said[0].startswith(begin) and late_s > covered_s
+        assert f"begin {late_s:.1f} s after the first frame; let a recording start at rest" in said[0]
+        assert ". Just before: not at rest: " in said[0]
 
 
 def test_images_that_are_not_of_the_stated_size_are_the_reason_of_a_run_without_a_frame(tmp_path: Path) -> None:
