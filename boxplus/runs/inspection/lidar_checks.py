@@ -14,16 +14,12 @@ from boxplus.recordings.open import open_recording
 from boxplus.recordings.options import RecordingOptions
 from boxplus.recordings.recording import Recording
 from boxplus.recordings.stream_checks import StreamLog, check_points, check_rate, check_rejected
+from boxplus.runs.lidar_inertial.first_lidar_alone import compare_by_first_alone
 from boxplus.runs.lidar_inertial.lidar_facts import watch_of
-from boxplus.sensors.scan import Scan
 from boxplus.sensors.scan_merger import LidarShare
 from boxplus.systems.lidar_inertial_agreement.hypotheses import matrix_text
-from boxplus.systems.lidar_odometry.odometry import LidarOdometry
 from boxplus.systems.several_lidars.judgement import PairJudgement
 
-_LONGEST_S = 120.0
-"""Of a recording, to look for stretches in which the LiDARs can be compared."""
-_WINDOWS = 3
 _MANY_LEFT_OUT = 0.01
 _VERDICTS: dict[str, Verdict] = {"agree": "ok", "contradicted": "error", "unverified": "warning"}
 
@@ -64,21 +60,8 @@ def compare_lidars(recording: Recording, report: Callable[[float], None]) -> lis
     watch = watch_of(recording)
     if watch is None:
         return []
-    watch.every_s = 0.0
-    odometry = LidarOdometry()
-    first_ns: int | None = None
-    for event in recording:
-        if not isinstance(event, Scan):
-            continue
-        first_ns = event.start_ns if first_ns is None else first_ns
-        report(min((event.end_ns - first_ns) * 1e-9 / min(_LONGEST_S, max(recording.info.duration_s, 1.0)), 1.0))
-        watch.add_scan(event)
-        for estimate in odometry.push_scan(event.of_lidar(0)):
-            watch.add_estimate(estimate)
-        judged = watch.judgements().values()
-        if (event.end_ns - first_ns) * 1e-9 > _LONGEST_S or min(windows for _, windows, _ in judged) >= _WINDOWS:
-            break
-    watch.finish()
+    length_s = max(recording.info.duration_s, 1.0)
+    compare_by_first_alone(recording, watch, lambda seconds: report(min(seconds / length_s, 1.0)))
     found = [_finding(name, *judgement) for name, judgement in watch.judgements().items()]
     return found + [_left_out(share, recording.rejected) for share in recording.lidars]
 

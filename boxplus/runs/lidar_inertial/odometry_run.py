@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 from boxplus._arguments import as_settings
-from boxplus.errors import InputError, printable
+from boxplus.errors import InputError, RecordingError, printable
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.maps.tiles.store import TileStore, merge
 from boxplus.maps.tiles.writer import TileWriter
@@ -19,6 +19,7 @@ from boxplus.recordings.recording import Recording
 from boxplus.runs.checkpoint import run_identity
 from boxplus.runs.lidar_inertial.config import RunConfig, dump_run_config
 from boxplus.runs.lidar_inertial.extrinsic import Extrinsic, choose_extrinsic
+from boxplus.runs.lidar_inertial.first_lidar_alone import compare_by_first_alone
 from boxplus.runs.lidar_inertial.lidar_facts import lidar_facts, lidar_warnings, watch_of
 from boxplus.runs.lidar_inertial.scan_clouds import ScanCloudWriter
 from boxplus.runs.lidar_inertial.scan_log import ScanLogWriter
@@ -34,6 +35,7 @@ from boxplus.sensors.sequencer import BEFORE_START, REPEATED
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_odometry.odometry import LidarOdometry
+from boxplus.systems.several_lidars.watch import LidarWatch
 
 
 class View(Protocol):
@@ -215,11 +217,29 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
     def at_end(self, state: State) -> None:
         """See `RunLoop.at_end`."""
         if self._watch is not None and state == "finished":
-            for text in self._watch.finish():
+            for text in self._last_words_of(self._watch):
                 self._statistics.warnings.add(text)
         super().at_end(state)
         if self._companion is not None:
             self._companion.finish()
+
+    def _last_words_of(self, watch: LidarWatch) -> list[str]:
+        """What is left to say of several LiDARs. Without an IMU a clock that is off bends their common path, and is hardly seen
+        along it: that of the first one by itself tells."""
+        told = watch.finish()
+        own = watch_of(self._recording)
+        if own is None or watch.contradiction is not None or not isinstance(self._odometry, LidarOdometry):
+            return told
+        self.stage = "comparing the LiDARs"
+        self.show_progress()
+        try:
+            found = compare_by_first_alone(self._recording.read_again(), own, determined=True)
+        except RecordingError:  # what was read once is gone; it was told what the run itself saw
+            return told
+        if not all(windows for _, windows, _ in own.judgements().values()):
+            return told
+        self._watch = own
+        return found
 
     def finish(self) -> None:
         """Merge the map."""

@@ -1,6 +1,7 @@
 """A run over several LiDARs: facts of each, faults named, the same bits when resumed, and the doctor's findings."""
 
 import json
+import re
 from functools import cache
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
-from boxplus.recordings import Recording, RecordingOptions
+from boxplus.recordings import Recording, RecordingOptions, open_recording
 from boxplus.runs.inspection.diagnosis import diagnose
 from boxplus.runs.inspection.lidar_checks import compare_lidars
 from boxplus.runs.lidar_inertial.config import MapConfig, RunConfig
@@ -86,3 +87,26 @@ def test_inspect_compares_the_lidars(tmp_path: Path) -> None:
     assert evidence[f"lidar_rate of {REAR}"].value == "10.0 Hz" and evidence["lidar_rate"].verdict == "ok"
     agreement = evidence[f"agreement of {REAR}"]
     assert agreement.verdict == "error" and agreement.value == "contradicted: pose" and "turned by 8." in agreement.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("offset_s", [0.0, 0.03, 0.06])
+def test_without_an_imu_the_own_path_of_the_first_lidar_tells_a_clock_that_is_off(tmp_path: Path, offset_s: float) -> None:
+    """The common path followed such a clock: 30 and 60 ms were found as 15 and 8, as agreement."""
+    other = MountedLidar(SpinningLidar(channels=8, azimuth_steps=300), T_IMU_REAR, REAR)
+    route = trajectories.walk(((-3.0, 0.0), (3.0, 0.0), (3.0, 2.5)), seed=2)
+    lidar = SpinningLidar(channels=16, azimuth_steps=300)
+    simulated = Simulation(Scenario("several", worlds.room((14.0, 10.0, 4.0), seed=2), route, lidar), 2, 10.5)
+    path = write_recording(simulated, tmp_path / "two", "ros1", others=(other,))
+    options = RecordingOptions(
+        lidar_topic="/lidar/points", imu_topic="none", other_lidars=({"topic": REAR, "time_offset_s": offset_s},)
+    )
+    with open_recording(path, options) as recording:
+        summary = run_odometry(recording, tmp_path / "out", CONFIG)
+    judged = summary.lidars[1]
+    if not offset_s:
+        assert judged.checked == "agree" and summary.contradiction is None
+    else:
+        assert judged.checked == "contradicted" and "its clock is wrong" in (summary.contradiction or "")
+        found = re.search(r"time_offset_s of ([-+][\d.]+) s more", summary.contradiction or "")
+        assert found is not None and abs(float(found[1]) + offset_s) < 0.2 * offset_s
