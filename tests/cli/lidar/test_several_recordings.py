@@ -118,10 +118,10 @@ def test_ctrl_c_after_the_last_scan_of_one_leaves_the_next_one_alone(
 @pytest.mark.slow
 def test_what_was_finished_with_other_settings_is_not_passed_off_as_these(bags: Path, tmp_path: Path) -> None:
     assert call("lio", bags / "in" / "a.bag", "-o", tmp_path / "a", *FAST).exit_code == 0
-    result = call("lio", bags / "in", "-o", tmp_path, *FAST, "--resume", "--json", "--set", "map_cell=0.4")
+    result = call("lio", bags / "in", "-o", tmp_path, *FAST, "--resume", "--json", "--set", "map_cell=0.3")
     assert result.exit_code == 3
     found = lines(result)
-    assert found["a"]["outcome"] == "failed" and "map_cell: 0.25" in found["a"]["error"] and "0.4" in found["a"]["error"]
+    assert found["a"]["outcome"] == "failed" and "map_cell: 0.25" in found["a"]["error"] and "0.3" in found["a"]["error"]
     assert found["b"]["outcome"] == found["c"]["outcome"] == "finished"
 
 
