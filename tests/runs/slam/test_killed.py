@@ -57,7 +57,7 @@ def files_in(folder: Path) -> set[str]:
 
 
 def test_a_run_that_is_killed_at_any_moment_goes_on_to_the_same_results(tmp_path: Path) -> None:
-    simulation = simulate("walk", duration_s=6.0, lidar=SpinningLidar(azimuth_steps=100))
+    simulation = simulate("walk", duration_s=6.0, lidar=SpinningLidar(azimuth_steps=200))
     bag, whole = write_recording(simulation, tmp_path / "walk", "ros1"), SlamFolder(tmp_path / "whole")
     settings = tmp_path / "settings.yaml"
     settings.write_text(dump_slam_config(CONFIG), encoding="utf-8")
