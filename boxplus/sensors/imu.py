@@ -72,6 +72,11 @@ class ImuSamples:
         """Some of the samples: those of a mask, of indices, or of a slice."""
         return ImuSamples(self.time_ns[which], self.gyro[which], self.accel[which])
 
+    def in_order(self) -> ImuSamples:
+        """Those that are later than all before them: what is recorded twice, or comes late, is left out."""
+        latest = np.maximum.accumulate(self.time_ns)
+        return self.where(np.concatenate([[True], latest[1:] > latest[:-1]])[: len(self)])
+
     def __len__(self) -> int:
         return int(self.time_ns.size)
 

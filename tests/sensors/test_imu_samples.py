@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from boxplus.errors import InputError
 from boxplus.sensors.imu import ImuSamples
@@ -57,3 +59,10 @@ def test_wrong_shapes_are_explained(time: object, gyro: object, accel: object, m
     with pytest.raises(InputError) as error:
         ImuSamples.from_arrays(time, gyro, accel)  # type: ignore[arg-type]
     assert message in str(error.value)
+
+
+@given(st.lists(st.integers(0, 20), max_size=12))
+def test_samples_in_order_are_later_than_all_before_them(times: list[int]) -> None:
+    samples = ImuSamples(np.array(times, dtype=np.int64), np.zeros((len(times), 3)), np.zeros((len(times), 3)))
+    kept = samples.in_order().time_ns.tolist()
+    assert kept == [time for k, time in enumerate(times) if all(time > before for before in times[:k])]

@@ -77,9 +77,8 @@ def _disagreement(
         (T_target_parent, to_parent), (T_target_child, to_child) = found[parent], found[child]
         if not on_way & (_steps(to_parent) ^ _steps(to_child)):
             continue
-        T = _inverse(T_parent_child) @ _inverse(T_target_parent) @ T_target_child
-        metres = float(np.linalg.norm(T[:3, 3]))
-        degrees = float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))))
+        angle, metres = apart(T_parent_child, _inverse(T_target_parent) @ T_target_child)
+        degrees = float(np.degrees(angle))
         if max(metres / _SAME_M, degrees / _SAME_DEG) > worst:
             worst = max(metres / _SAME_M, degrees / _SAME_DEG)
             text = (
@@ -87,6 +86,13 @@ def _disagreement(
                 "what the others say"
             )
     return text
+
+
+def apart(T: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[float, float]:
+    """Angle [rad] and distance [m] between two transforms (4, 4)."""
+    between = _inverse(T) @ other
+    half_sine = np.linalg.norm(between[:3, :3] - np.eye(3)) / np.sqrt(8.0)
+    return float(2.0 * np.arcsin(min(half_sine, 1.0))), float(np.linalg.norm(between[:3, 3]))
 
 
 def _steps(way: list[str]) -> set[frozenset[str]]:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from boxplus.errors import RecordingError
-from boxplus.recordings.cameras.calibration import THIS_IS_THE_BODY, StatedCamera, inverse
+from boxplus.recordings.bags.transforms import apart
+from boxplus.recordings.cameras.calibration import THIS_IS_THE_BODY, StatedCamera
 from boxplus.recordings.cameras.info import CameraStream, ImageKind
 from boxplus.recordings.info import Evidence
 
@@ -89,7 +90,7 @@ def _resolved(index: int, camera: FoundCamera) -> tuple[CameraStream, list[Evide
                 text = f"{sources['T_body_camera']}: {stated.mounting_doubt}; find out which belongs to this rig"
                 evidence.append(Evidence(f"{camera.name}_mounting", "contradicted", "warning", text))
         elif T_body_camera is not None and stated.T_body_camera is not None:
-            turned, moved = _difference(T_body_camera, stated.T_body_camera)
+            turned, moved = apart(T_body_camera, stated.T_body_camera)
             if turned > _SAME_ANGLE or moved > _SAME_PLACE:
                 text = (
                     f"{sources['T_body_camera']} and {stated.mounting_source or stated.source} differ by "
@@ -134,13 +135,6 @@ def _same_model(one: object, other: object) -> bool:
     longest = max(len(a), len(b))
     a, b = (np.pad(v, (0, longest - len(v))) for v in (a, b))
     return type(one) is type(other) and bool(np.all(np.abs(a - b) <= _SAME_INTRINSICS * np.maximum(np.abs(a), 1.0)))
-
-
-def _difference(T: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """Angle [rad] and distance [m] between two transforms."""
-    between = inverse(T) @ other
-    angle = float(np.linalg.norm(between[:3, :3] - np.eye(3)) / np.sqrt(2.0))  # 2 sin(angle / 2)
-    return angle, float(np.linalg.norm(between[:3, 3]))
 
 
 def _calibration_evidence(stream: CameraStream) -> list[Evidence]:

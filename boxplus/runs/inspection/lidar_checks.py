@@ -14,7 +14,7 @@ from boxplus.recordings.open import open_recording
 from boxplus.recordings.options import RecordingOptions
 from boxplus.recordings.recording import Recording
 from boxplus.recordings.stream_checks import StreamLog, check_points, check_rate, check_rejected
-from boxplus.runs.lidar_inertial.first_lidar_alone import compare_by_first_alone
+from boxplus.runs.lidar_inertial.first_lidar_alone import LONGEST_S, compare_by_first_alone
 from boxplus.runs.lidar_inertial.lidar_facts import watch_of
 from boxplus.sensors.scan_merger import LidarShare
 from boxplus.systems.lidar_inertial_agreement.hypotheses import matrix_text
@@ -60,7 +60,7 @@ def compare_lidars(recording: Recording, report: Callable[[float], None]) -> lis
     watch = watch_of(recording)
     if watch is None:
         return []
-    length_s = max(recording.info.duration_s, 1.0)
+    length_s = min(LONGEST_S, max(recording.info.duration_s, 1.0))
     compare_by_first_alone(recording, watch, lambda seconds: report(min(seconds / length_s, 1.0)))
     found = [_finding(name, *judgement) for name, judgement in watch.judgements().items()]
     return found + [_left_out(share, recording.rejected) for share in recording.lidars]

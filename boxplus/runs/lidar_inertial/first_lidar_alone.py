@@ -10,7 +10,7 @@ from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_odometry.odometry import LidarOdometry
 from boxplus.systems.several_lidars.watch import LidarWatch
 
-_LONGEST_S = 120.0
+LONGEST_S = 120.0
 """Of a recording, to look for stretches in which the LiDARs can be compared."""
 _WINDOWS = 3
 
@@ -38,12 +38,12 @@ def compare_by_first_alone(
             continue
         first_ns = event.start_ns if first_ns is None else first_ns
         seconds = (event.end_ns - first_ns) * 1e-9
-        report(min(seconds, _LONGEST_S))
+        report(seconds)
         watch.add_scan(event)
         for estimate in odometry.push_scan(event.of_lidar(0)):
             # Where it does not see its way by itself, it may have slid along it: that is no error of another one.
             is_open = determined and estimate.status == "weak"
             told += watch.add_estimate(replace(estimate, status="lost") if is_open else estimate)
-        if seconds > _LONGEST_S or min(windows for _, windows, _ in watch.judgements().values()) >= _WINDOWS:
+        if seconds > LONGEST_S or min(windows for _, windows, _ in watch.judgements().values()) >= _WINDOWS:
             break
     return told + watch.finish()

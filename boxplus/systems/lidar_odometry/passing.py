@@ -22,6 +22,7 @@ from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.local_maps.vertical import find_vertical
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import CommonMotion, common_motion
+from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import turning_through
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Poses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
 from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surfaces_across
@@ -148,10 +149,4 @@ def passing_motion(scans: Sequence[Scan], poses: Poses) -> CommonMotion | None:
 def turning_along(time_ns: NDArray[np.int64], R: Floats) -> Turning:
     """How a LiDAR turned between some attitudes R (K, 3, 3), K at least 2, at `time_ns` (K,), and beyond them as next to them."""
     rates = so3.log(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / (np.diff(time_ns)[:, None] * 1e-9)
-
-    def at(asked_ns: NDArray[np.int64]) -> Floats:
-        k = np.clip(np.searchsorted(time_ns, asked_ns, side="right") - 1, 0, len(rates) - 1)
-        turned: Floats = R[k] @ so3.exp(((asked_ns - time_ns[k]) * 1e-9)[:, None] * rates[k])
-        return turned
-
-    return at
+    return turning_through(time_ns, R, rates[np.maximum(np.arange(len(R)) - 1, 0)])

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from boxplus.recordings.bags.transforms import chain
+from boxplus.recordings.bags.transforms import apart, chain
 
 
 def matrix(values: np.ndarray) -> np.ndarray:
@@ -84,3 +84,13 @@ def test_a_transform_published_again_with_two_digits_says_the_same(seed: int) ->
         assert found is not None and not found.disagreement
     found = chain([("base", "lidar", full), ("base", "lidar", short + np.array([0.02, 0, 0, 0, 0, 0, 0]))], "base", "lidar")
     assert found is not None and found.disagreement
+
+
+@given(st.floats(0.0, 3.14), st.integers(0, 1000))
+def test_how_far_transforms_are_apart(angle: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T, between = np.eye(4), np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3)
+    axis, between[:3, 3] = rng.normal(size=3), rng.normal(size=3)
+    between[:3, :3] = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+    np.testing.assert_allclose(apart(T, T @ between), (angle, np.linalg.norm(between[:3, 3])), atol=1e-6)

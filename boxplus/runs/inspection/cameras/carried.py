@@ -37,11 +37,11 @@ def check_carried(camera: CameraStream, pairs: list[Followed], imu: ImuSamples) 
     """A finding where much of what a camera shows is fixed to it; none otherwise, or where that cannot be told."""
     if camera.model is None or camera.T_body_camera is None:
         return []
-    order = np.concatenate([[True], np.diff(np.maximum.accumulate(imu.time_ns)) > 0])
-    time_ns, gyro = imu.time_ns[order], imu.gyro[order] @ camera.T_body_camera[:3, :3]
+    imu = imu.in_order()
+    gyro = imu.gyro @ camera.T_body_camera[:3, :3]
     still = asked = 0
     for pair in pairs:
-        first, last = np.searchsorted(time_ns, (pair.begin_ns, pair.end_ns))
+        first, last = np.searchsorted(imu.time_ns, (pair.begin_ns, pair.end_ns))
         moved = np.linalg.norm(pair.after - pair.before, axis=1)
         if last - first < 2 or not len(moved) or (moved > 2.0 * _STILL_PX).mean() < _OTHERS:
             continue

@@ -80,9 +80,9 @@ def known_turns(
     """
     if camera.model is None:
         return []
-    order = np.concatenate([[True], np.diff(np.maximum.accumulate(imu.time_ns)) > 0])
-    time_s = (imu.time_ns[order] - imu.time_ns[0]) * 1e-9
-    gyro = (imu.gyro[order] - aligned.bias) @ aligned.R_imu_camera
+    imu = imu.in_order()
+    time_s = (imu.time_ns - imu.time_ns[0]) * 1e-9
+    gyro = (imu.gyro - aligned.bias) @ aligned.R_imu_camera
     between = np.vstack([np.zeros((1, 3)), np.cumsum(0.5 * (gyro[1:] + gyro[:-1]) * np.diff(time_s)[:, None], axis=0)])
     pairs, margin_s, shift_s = [], _MARGIN_S + aligned.offset_std_s, deviations * aligned.offset_std_s
     for begin_ns, end_ns, before, after in zip(turns.begin_ns, turns.end_ns, turns.before, turns.after, strict=True):

@@ -111,9 +111,8 @@ class Alignment:
 
 def align(turns: Turns, imu: ImuSamples) -> Alignment | str:
     """The alignment, or why there is none."""
-    order = np.concatenate([[True], np.diff(np.maximum.accumulate(imu.time_ns)) > 0])
-    time_s = (imu.time_ns[order] - imu.time_ns[0]) * 1e-9
-    gyro = imu.gyro[order]
+    imu = imu.in_order()
+    time_s, gyro = (imu.time_ns - imu.time_ns[0]) * 1e-9, imu.gyro
     if len(turns.rotation) < _FEWEST or len(time_s) < _FEWEST:
         return f"{len(turns.rotation)} rotations of the camera and {len(time_s)} IMU samples: too few"
     between = np.vstack([np.zeros((1, 3)), np.cumsum(0.5 * (gyro[1:] + gyro[:-1]) * np.diff(time_s)[:, None], axis=0)])

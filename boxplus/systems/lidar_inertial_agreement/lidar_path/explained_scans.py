@@ -75,7 +75,7 @@ def explained_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[T
         if astray is None and elsewhere and float(part.weak.mean()) < _FEW_WEAK and more_off > _MORE_OFF:
             twists = [expected[number] for number in numbers]
             # Where all but a few things go along with the LiDAR, as on a highway, it is the path that has gone astray.
-            if not explains_changes(chosen, _turning(other, twists), twists):
+            if not explains_changes(chosen, turning_through(other[0], other[1], np.array([rate for rate, _ in twists])), twists):
                 astray = _astray(part.poses, other, more_off)
     return Explained(by_path, astray)
 
@@ -117,10 +117,8 @@ def _reckoned(scans: Sequence[Scan], expected: Sequence[Twist]) -> Poses:
     return np.array([scan.end_ns for scan in scans]), np.array(R), np.array(p)
 
 
-def _turning(motion: Poses, twists: Sequence[Twist]) -> Turning:
-    """The attitudes in between, at the rate of every step."""
-    ends, R, _ = motion
-    rates = np.array([rate for rate, _ in twists])
+def turning_through(ends: NDArray[np.int64], R: NDArray[np.float64], rates: NDArray[np.float64]) -> Turning:
+    """How a LiDAR turned through attitudes R (K, 3, 3) at `ends` (K,), at the rates (K, 3) of the steps that they end."""
 
     def at(time_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         k = np.clip(np.searchsorted(ends, time_ns), 0, len(ends) - 1)
