@@ -158,6 +158,8 @@ def opened_real(made: RealDraw, options: RecordingOptions) -> Iterator[Recording
         declared = made.spoiled.declared_extrinsic(made.T_true)
         source = "" if declared is None else "the campaign"
         info = replace(recording.info, T_imu_lidar=declared, T_imu_lidar_source=source)
+        # What the reader says of the mounting is not what is declared here.
+        info.evidence[:] = [entry for entry in info.evidence if entry.key != "T_imu_lidar"]
 
         def read(tally: Tally) -> Iterator[Event]:
             for event in made.spoiled.events(recording.events()):
