@@ -173,6 +173,37 @@ def accumulate_planes(
         _mirror(noise)
 
 
+@kernel
+def accumulate_parts(
+    x: NDArray[np.float64],
+    p_lidar: NDArray[np.float32],
+    planes: NDArray[np.float64],
+    fate: NDArray[np.uint8],
+    bounds: NDArray[np.int64],
+    range_variance: float,
+    map_variance: float,
+    with_extrinsic: bool,
+    with_criterion: bool,
+    A: NDArray[np.float64],
+    b: NDArray[np.float64],
+    pull: NDArray[np.float64],
+    signal: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    sums: NDArray[np.float64],
+) -> None:
+    """`accumulate_planes` part by part: A (m, 12, 12) and b (m, 12) are those of each, everything else that of all together.
+
+    Args:
+        bounds: (m + 1,) the first point of each part, and the end of the last.
+    """
+    for part in range(bounds.shape[0] - 1):
+        begin, end = bounds[part], bounds[part + 1]
+        accumulate_planes(
+            x, p_lidar[begin:end], planes[begin:end], fate[begin:end], range_variance, map_variance, with_extrinsic,
+            with_criterion, A[part], b[part], pull, signal, noise, sums,
+        )  # fmt: skip
+
+
 @kernel(inline=True)
 def _mirror(A: NDArray[np.float64]) -> None:
     """The lower triangle from the upper one."""

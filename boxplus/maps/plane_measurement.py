@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,7 @@ from boxplus.filtering.plane_information import (
     ONE_LINE,
     UNCONFIRMED,
     USED,
-    accumulate_planes,
+    accumulate_parts,
 )
 from boxplus.filtering.small_linalg import cholesky_inverse_into
 from boxplus.maps.curved_patches import FILLED_CELLS, MEAN_LEVERAGE, PATCH, bend_planes
@@ -92,20 +91,7 @@ class PlaneMeasurement:
 
     def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
         """The information at the packed state x (36,); `rematch` searches the neighbours anew."""
-        matches = rematch or not self._matched
-        if matches:
-            self._match(x)
-        total = self._sums(x, self._p_lidar, self._planes, self._fate, criterion=matches)
-        if matches and self._confirm and self._look_closer(x, total):
-            total = self._sums(x, self._p_lidar, self._planes, self._fate, criterion=True)
-        A, b, pull, signal, noise, sums = total
-        if matches:  # in between the planes stay, and what they can tell
-            self._pull = pull
-            threshold = threshold_for(self._config.weak_threshold, int(sums[0]))
-            self._directions = pose_directions(signal, noise, self.lever_arm, threshold)
-        used = int(sums[0])
-        rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
-        return Information(A * self._weight, b * self._weight, self._pull * self._weight, self._directions, used, rms)
+        return self.in_parts(x, (0, self.points), rematch=rematch)[0]
 
     def in_parts(
         self, x: NDArray[np.float64], bounds: Sequence[int], *, rematch: bool
@@ -113,15 +99,24 @@ class PlaneMeasurement:
         """The same, with what each of successive parts of the points says: A (m, 12, 12) and b (m, 12).
 
         Args:
-            bounds: (m + 1,) the first point of each part, and the number of points.
+            bounds: (m + 1,) the first point of each part, and the number of points; the first is 0.
         """
-        whole = self.at(x, rematch=rematch)
-        sums = [
-            self._sums(x, self._p_lidar[begin:end], self._planes[begin:end], self._fate[begin:end], criterion=False)
-            for begin, end in pairwise(bounds)
-        ]
-        A, b = np.array([part[0] for part in sums]), np.array([part[1] for part in sums])
-        return whole, A * self._weight, b * self._weight
+        edges = np.array(bounds, dtype=np.int64)
+        matches = rematch or not self._matched
+        if matches:
+            self._match(x)
+        total = self._sums(x, edges, criterion=matches)
+        if matches and self._confirm and self._look_closer(x, total[0].sum(axis=0), int(total[5][0])):
+            total = self._sums(x, edges, criterion=True)
+        A, b, pull, signal, noise, sums = total
+        if matches:  # in between the planes stay, and what they can tell
+            self._pull = pull
+            threshold = threshold_for(self._config.weak_threshold, int(sums[0]))
+            self._directions = pose_directions(signal, noise, self.lever_arm, threshold)
+        used = int(sums[0])
+        rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
+        A, b = A * self._weight, b * self._weight
+        return Information(A.sum(axis=0), b.sum(axis=0), self._pull * self._weight, self._directions, used, rms), A, b
 
     def has_moved(self, x: NDArray[np.float64]) -> bool:
         """Whether the points have moved far enough since the last search for some to have other neighbours."""
@@ -152,39 +147,35 @@ class PlaneMeasurement:
         counts = np.bincount(self._fate, minlength=6)
         return {reason: int(counts[fate]) for fate, reason in REASONS.items() if counts[fate]}
 
-    def _sums(
-        self,
-        x: NDArray[np.float64],
-        p_lidar: NDArray[np.float32],
-        planes: NDArray[np.float64],
-        fate: NDArray[np.uint8],
-        *,
-        criterion: bool,
-    ) -> tuple[NDArray[np.float64], ...]:
-        """What `accumulate_planes` adds up over planes: A, b, pull, signal, noise and sums."""
-        A, (b, pull) = np.zeros((MEASURED_DOF, MEASURED_DOF)), np.zeros((2, MEASURED_DOF))
+    def _sums(self, x: NDArray[np.float64], bounds: NDArray[np.int64], *, criterion: bool) -> tuple[NDArray[np.float64], ...]:
+        """What `accumulate_parts` adds up over planes: A, b, pull, signal, noise and sums."""
+        parts = len(bounds) - 1
+        A, b, pull = np.zeros((parts, MEASURED_DOF, MEASURED_DOF)), np.zeros((parts, MEASURED_DOF)), np.zeros(MEASURED_DOF)
         signal, noise, sums = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(2)
         point, stored = self._config.range_sigma**2, self._config.map_sigma**2
-        accumulate_planes(
-            x, p_lidar, planes, fate, point, stored, self._with_extrinsic, criterion, A, b, pull, signal, noise, sums
-        )
+        accumulate_parts(
+            x, self._p_lidar, self._planes, self._fate, bounds, point, stored, self._with_extrinsic, criterion,
+            A, b, pull, signal, noise, sums,
+        )  # fmt: skip
         return A, b, pull, signal, noise, sums
 
-    def _look_closer(self, x: NDArray[np.float64], total: tuple[NDArray[np.float64], ...]) -> bool:
+    def _look_closer(self, x: NDArray[np.float64], information: NDArray[np.float64], used: int) -> bool:
         """Refuse planes on which too much hangs (`plane_confirmation`), bend those that are none (`curved_patches`).
 
         Args:
             x: (36,) packed state.
-            total: what all planes add up to (`_sums`).
+            information: (12, 12) of all planes, from so many points `used`.
 
         Returns:
             Whether any was refused or bent.
         """
-        config, A, used = self._config, total[0][:6, :6], max(int(total[5][0]), 1)
+        config = self._config
         covariance, work = np.empty((2, 6, 6))
-        if not cholesky_inverse_into(np.ascontiguousarray(A), covariance, work):  # nothing at all measures some direction
+        if not cholesky_inverse_into(
+            np.ascontiguousarray(information[:6, :6]), covariance, work
+        ):  # nothing at all measures some direction
             return False
-        mean_leverage = 6.0 / used
+        mean_leverage = 6.0 / max(used, 1)
         refused = confirm_planes(
             self._tree.view(),
             self._tree.origin,

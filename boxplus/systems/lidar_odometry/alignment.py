@@ -93,7 +93,7 @@ def align(
         nodes = motion.nodes(edges)
         deskew_into(points.p_lidar, points.time_ns, prior.first.time_ns, nodes, len(nodes), x, at_end)
         if measurement is None:
-            measurement = PlaneMeasurement(at_end, tree, config, with_extrinsic=False, weight=points.weight)
+            measurement = PlaneMeasurement(at_end, tree, config, with_extrinsic=False, weight=points.weight, confirm=True)
         said, A_parts, b_parts = measurement.in_parts(x, bounds, rematch=steps == 0 or measurement.has_moved(x))
         if said.used < config.min_points:
             expected = cov_prior[_LAST_POSE, _LAST_POSE]

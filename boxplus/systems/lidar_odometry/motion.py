@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.filtering.nav_state import NavState
-from boxplus.filtering.propagation import N_A, N_P, N_R, N_TIME, N_V, N_W, NODE
+from boxplus.filtering.propagation import NODE
 from boxplus.manifolds import so3
+from boxplus.systems.lidar_odometry.between import jacobians_into, nodes_into, poses_into
 
 DOF = 12
 THETA, POSITION, RATE, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
@@ -112,29 +113,20 @@ class MotionBetween:
     def __init__(self, first: MotionState, last: MotionState) -> None:
         self.first, self.last = first, last
         self.seconds = (last.time_ns - first.time_ns) * 1e-9
-        self._turn = so3.log(first.R_world_lidar.T @ last.R_world_lidar)
-        self._turn_rate = so3.right_jacobian_inverse(self._turn) @ last.rate
+        turn = so3.log(first.R_world_lidar.T @ last.R_world_lidar)
+        rates = first.rate, turn, so3.right_jacobian_inverse(turn) @ last.rate
+        self._ends = np.array([*rates, first.p_world_lidar, first.velocity, last.p_world_lidar, last.velocity])
 
     def poses(self, seconds: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Turning since the first state (n, 3), position (n, 3) and velocity (n, 3) so long after it [s]."""
-        (a, b, c, d), (da, db, dc, dd) = _hermite(seconds, self.seconds)
-        first, last = self.first, self.last
-        turn = b[:, None] * first.rate + c[:, None] * self._turn + d[:, None] * self._turn_rate
-        ends = np.stack([first.p_world_lidar, first.velocity, last.p_world_lidar, last.velocity])
-        return turn, np.stack([a, b, c, d], axis=1) @ ends, np.stack([da, db, dc, dd], axis=1) @ ends
+        turn, p, v = np.empty((3, len(seconds), 3))
+        poses_into(self._ends, self.seconds, seconds, turn, p, v)
+        return turn, p, v
 
     def nodes(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
         """Nodes (n − 1, 22) at so many seconds (n,) after the first state, as the deskewing of points takes them."""
-        turn, p, v = self.poses(seconds)
-        R = self.first.R_world_lidar @ so3.exp(turn)
-        steps = np.diff(seconds)[:, None]
         nodes = np.zeros((len(seconds) - 1, NODE))
-        nodes[:, N_TIME] = seconds[:-1]
-        nodes[:, N_R : N_R + 9] = R[:-1].reshape(-1, 9)
-        nodes[:, N_P : N_P + 3] = p[:-1]
-        nodes[:, N_V : N_V + 3] = v[:-1]
-        nodes[:, N_A : N_A + 3] = 2.0 * (p[1:] - p[:-1] - steps * v[:-1]) / steps**2
-        nodes[:, N_W : N_W + 3] = so3.log(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / steps
+        nodes_into(self._ends, self.seconds, self.first.R_world_lidar, seconds, nodes)
         return nodes
 
     def jacobians(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -142,31 +134,7 @@ class MotionBetween:
 
         In terms of the last pose: the error `[θ, p]` of it that moves the point as the errors of the states do.
         """
-        (a, b, c, d), _ = _hermite(seconds, self.seconds)
-        turn, p, _ = self.poses(seconds)
-        since = so3.exp(turn)  # R_first_point
-        after, before = so3.right_jacobian_inverse(self._turn), so3.left_jacobian_inverse(self._turn)
-        # How the turning at a point's time follows what it is interpolated from; then the attitude, on its right.
-        bend = so3.right_jacobian(turn)
-        # The turning to the last state moves what lies between directly, and by the last rate as seen along it (to first order).
-        along = c[:, None, None] * np.eye(3) - 0.5 * d[:, None, None] * so3.hat(self.last.rate)
-        own = np.zeros((len(seconds), 3, 2 * DOF))
-        own[:, :, THETA] = np.swapaxes(since, 1, 2) - bend @ along @ before
-        own[:, :, RATE] = b[:, None, None] * bend
-        own[:, :, DOF : DOF + 3] = bend @ along @ after
-        own[:, :, DOF + 6 : DOF + 9] = d[:, None, None] * (bend @ after)
-        turned = (self.first.R_world_lidar @ since) @ own
         J = np.empty((len(seconds), 6, 2 * DOF))
-        J[:, :3] = self.last.R_world_lidar.T @ turned
-        J[:, 3:] = np.cross(p[:, :, None] - self.last.p_world_lidar[None, :, None], turned, axis=1)
-        for column, factor in ((3, a), (9, b), (DOF + 3, c), (DOF + 9, d)):
-            J[:, 3:, column : column + 3] += factor[:, None, None] * np.eye(3)
+        first, last = self.first, self.last
+        jacobians_into(self._ends, self.seconds, first.R_world_lidar, last.R_world_lidar, last.rate, seconds, J)
         return J
-
-
-def _hermite(t: NDArray[np.float64], T: float) -> tuple[tuple[NDArray[np.float64], ...], tuple[NDArray[np.float64], ...]]:
-    """Factors of the first value, its rate, the last value, its rate after t of T seconds; and their derivatives."""
-    s = t / T
-    values = (1 - 3 * s**2 + 2 * s**3, T * (s - 2 * s**2 + s**3), 3 * s**2 - 2 * s**3, T * (s**3 - s**2))
-    rates = ((6 * s**2 - 6 * s) / T, 1 - 4 * s + 3 * s**2, (6 * s - 6 * s**2) / T, 3 * s**2 - 2 * s)
-    return values, rates

@@ -18,6 +18,7 @@ from boxplus._arguments import as_settings
 from boxplus._stopwatch import Stopwatch
 from boxplus.filtering.map_datum import SHARED_ERRORS, MapDatum
 from boxplus.filtering.nav_state import T_V, TANGENT
+from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.sliding_box import SlidingBox
 from boxplus.sensors.checked import checked_imu
@@ -29,6 +30,7 @@ from boxplus.sensors.sequencer import AFTER_GAP, BEFORE_START, Sequencer
 from boxplus.systems.lidar_inertial_odometry.config import LidarOdometryConfig, LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Status, WeakDirection
 from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
+from boxplus.systems.lidar_inertial_odometry.watches.long_baseline import LongBaseline
 from boxplus.systems.lidar_inertial_odometry.watches.weak_spell import WeakSpell
 from boxplus.systems.lidar_odometry.alignment import Alignment, ScanPoints, align
 from boxplus.systems.lidar_odometry.motion import DOF, VELOCITY, MotionBetween, MotionState, joint_prior, nav_state
@@ -94,6 +96,7 @@ class LidarOdometry(Snapshots):
         self._weak_s = 0.0
         self._longest_weak_s = 0.0
         self._passing = PassingWatch()
+        self._arrivals, self._long_baseline = FirstArrivals(self.config.map_cell), LongBaseline(self.config, with_imu=False)
         self._gap: str | None = None
         self._last_position = np.zeros(3)
         self._warnings: list[str] = []
@@ -164,6 +167,7 @@ class LidarOdometry(Snapshots):
         self._last_position = self._state.p_world_lidar
         self.map = IkdTree(cell_size=self.config.map_cell, rebuild="incremental")
         self._box = SlidingBox(self.config.box_side, self.config.detection_range)
+        self._arrivals, self._long_baseline = FirstArrivals(self.config.map_cell), LongBaseline(self.config, with_imu=False)
         self._density = ObservedDensity()
         self._passing.restart()
         self._judged_ns = None
@@ -203,6 +207,7 @@ class LidarOdometry(Snapshots):
         clock.lap("deskew and voxel filter")
         for low, high in self._box.follow(prior.last.p_world_lidar):
             self.map.delete_box(low, high)
+            self._arrivals.forget_map()
         clock.lap("slide map")
         found = align(prior, cov_prior, points, self.map, self._until_shown if self._open else self.config, _MOST_STEPS)
         taken = found.valid and found.measurement.fitting_share >= _LEAST_FITTING
@@ -223,11 +228,18 @@ class LidarOdometry(Snapshots):
         if taken or len(self.map) == 0:
             self._insert(p_lidar[self._voxel_filter.representatives])
         clock.lap("map insertion")
-        text = self._passing.add(scan, self._state, found.last.directions, self.map) if taken else None
-        if text is not None:
-            self._warnings.append(text)
+        if taken:
+            self._watch(scan, x, p_lidar[self._voxel_filter.representatives], found)
         clock.lap("watch")
         return self._estimate(scan, p_lidar, found, taken, cov_prior[DOF:, DOF:], clock.laps)
+
+    def _watch(self, scan: Scan, x: NDArray[np.float64], p_lidar: NDArray[np.float32], found: Alignment) -> None:
+        """What speaks against the estimate x (36,) after a scan that fitted the map; its points (n, 3) as the map has them."""
+        p_world = nav_state(self._state).to_world(p_lidar)
+        drift = self._long_baseline.follow(self._state.time_ns, x, p_lidar, p_world, self._datum)
+        self._warnings += drift.warnings if drift is not None else []
+        text = self._passing.add(scan, self._state, found.last.directions, self.map)
+        self._warnings += [text] if text is not None else []
 
     def _thinned(self, scan: Scan, motion: MotionBetween) -> ScanPoints:
         """Means over voxels of the points as seen, and of their times; the voxels are those of the motion that is expected."""
@@ -240,7 +252,7 @@ class LidarOdometry(Snapshots):
 
     def _insert(self, p_lidar: NDArray[np.float32]) -> None:
         p_world = nav_state(self._state).to_world(p_lidar)
-        self._datum.insert(self.map.insert(p_world, downsample=True).inserted)
+        self._datum.insert(*self._arrivals.insert_into(self.map, p_world, self._state.time_ns))
 
     def _status(self, scan: Scan, found: Alignment, taken: bool) -> Status:
         status = self._weak_spell.status(scan.end_ns, found.last.directions, taken)

@@ -15,6 +15,7 @@ from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, SpinningLidar, simulate
 from boxplus.systems.lidar_inertial_odometry.config import LidarOdometryConfig, LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
+from boxplus.systems.lidar_inertial_odometry.watches import long_baseline
 from boxplus.systems.lidar_odometry.odometry import LidarOdometry
 
 SPARSE = SpinningLidar(azimuth_steps=600)
@@ -139,3 +140,18 @@ def test_scans_that_cannot_be_used_are_counted() -> None:
     assert odometry.start is None and odometry.start_problem is not None
     assert odometry.counters["scan with a repeated time"] == 1
     assert odometry.counters["scan before a start could be found"] == 12
+
+
+def test_scans_apart_that_do_not_fit_are_told_and_cover_the_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With 16 rings from rest a street tilted by a degree within a second, each scan `ok`: scans apart show it."""
+    off, known = np.array([0.0, 0.02, 0.0, 0.1, 0.0, 0.0]), np.diag(np.repeat([1e-3, 0.01], 3) ** 2)
+    scans = _scans(simulate("walk", duration_s=3.6, lidar=SPARSE))
+    plain = _run(LidarOdometry(), scans)
+    monkeypatch.setattr(long_baseline, "register_to", lambda *_: (off, known))
+    estimates = _run(LidarOdometry(), scans)
+    texts = [text for estimate in estimates for text in estimate.warnings]
+    assert texts and all("by 10.0 cm and 1.15 deg" in text and "T_imu_lidar" not in text for text in texts)
+    assert not any(estimate.warnings for estimate in plain)
+    widened = estimates[-1].pose_covariance - plain[-1].pose_covariance
+    assert widened[3, 3] > len(texts) * 0.9 * off[3] ** 2
+    assert widened[1, 1] > len(texts) * 0.9 * off[1] ** 2

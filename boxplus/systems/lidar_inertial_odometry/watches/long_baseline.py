@@ -53,10 +53,12 @@ class LongBaseline:
 
     Args:
         config: of the odometry: noise and cells of the map.
+        with_imu: whether a mounting may be at fault.
     """
 
-    def __init__(self, config: RegistrationConfig) -> None:
+    def __init__(self, config: RegistrationConfig, *, with_imu: bool = True) -> None:
         self._config = config.model_copy(update={"threads": 1})
+        self._causes = "few rings, a repeating pattern, foliage" + (", or T_imu_lidar" if with_imu else "")
         self._recent: deque[NDArray[np.float64]] = deque(maxlen=_MAP_SCANS)
         self._old: list[NDArray[np.float64]] = []
         self._old_ns = 0
@@ -111,7 +113,7 @@ class LongBaseline:
             warnings.append(
                 f"scans {seconds:.3g} s apart do not fit each other as they were placed: by "
                 f"{np.linalg.norm(delta[3:]) * 100:.1f} cm and {np.degrees(np.linalg.norm(delta[:3])):.2f} deg, "
-                f"{deviations:.0f} standard deviations: the estimate drifts, where single scans do not show it (few rings, a "
-                "repeating pattern, foliage, or T_imu_lidar); covariance widened"
+                f"{deviations:.0f} standard deviations: the estimate drifts, where single scans do not show it "
+                f"({self._causes}); covariance widened"
             )
         return Drift(positive_part(np.outer(delta, delta) - C), deviations, warnings)
