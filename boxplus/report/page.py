@@ -55,6 +55,7 @@ def _body(data: RunData) -> str:
         text = "Magnitude, and the change of its direction since the first estimate."
         parts.append(figure_section("Biases", "With one standard deviation.", figures.biases(data)))
         parts.append(figure_section("Gravity", text, figures.gravity(data)))
+    parts.append(_sensors(data))
     parts.append(_extrinsic(data))
     parts.append(_lidars(data))
     text = "Points of a scan after the voxel filter, and the root mean square distance of the used ones from their planes."
@@ -136,6 +137,18 @@ def _stage_table(data: RunData) -> str:
     stages = dict(timing.stages_ms) | ({"all stages": timing.scan_ms} if timing.scan_ms is not None else {})
     rows = [(name, f"{d.median:.2f}", f"{d.p99:.2f}", f"{d.max:.2f}") for name, d in stages.items()]
     return html_table(rows, ("stage", "median [ms]", "99th percentile", "largest"))
+
+
+def _sensors(data: RunData) -> str:
+    if not data.summary.sensors:
+        return ""
+    text = (
+        "LiDAR and IMU are compared every few seconds, and what contradicts is named. What the motion has not shown could be "
+        "wrong without a word: on a straight way at a steady speed a factor on all points, say."
+    )
+    rows = [("shown" if part.shown else "not shown", part.text) for part in data.summary.sensors]
+    table = html_table(rows, ("by the motion", "what"))
+    return f"<section><h2>What the motion has shown</h2><p>{escape(text)}</p>{table}</section>"
 
 
 def _extrinsic(data: RunData) -> str:

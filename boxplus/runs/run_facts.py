@@ -104,6 +104,11 @@ class RunFacts(Part, ABC):
         return "m"
 
     @property
+    def not_shown(self) -> str | None:
+        """What of the sensors the motion has not shown, so that an error would have gone unnoticed; None if nothing."""
+        return None
+
+    @property
     @abstractmethod
     def progress(self) -> float:
         """Share of the recording that was read, 0 to 1."""

@@ -111,6 +111,7 @@ def test_page_is_self_contained_and_has_its_sections(folder: Path) -> None:
         "Uncertainty",
         "Biases",
         "Gravity",
+        "What the motion has shown",
         "Extrinsic",
         "Points",
         "Gaps and rejections",

@@ -118,6 +118,8 @@ class RunTerminal(Terminal):
             self.alarms.print(f"… and {len(untold) - _SHOWN_WARNINGS} more warnings in run.json")
         for text in warnings:
             self.warn(text)
+        if summary.not_shown is not None:
+            self.say(f"not shown by the motion, so that an error of it would go unnoticed: {summary.not_shown}")
         self.print_files(folder, files)
 
     def print_table(self, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -23,6 +23,7 @@ from boxplus.runs.lidar_inertial.first_lidar_alone import compare_by_first_alone
 from boxplus.runs.lidar_inertial.lidar_facts import lidar_facts, lidar_warnings, watch_of
 from boxplus.runs.lidar_inertial.scan_clouds import ScanCloudWriter
 from boxplus.runs.lidar_inertial.scan_log import ScanLogWriter
+from boxplus.runs.lidar_inertial.sensor_facts import sensor_facts
 from boxplus.runs.lidar_inertial.statistics import RunStatistics
 from boxplus.runs.lidar_inertial.summary import ExtrinsicFacts, MapFacts, RecordingFacts, RunSummary, TimingFacts
 from boxplus.runs.resumable_run import ResumableRun
@@ -301,6 +302,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
                 sigma_end_deg=sigma_deg,
                 sigma_end_m=sigma_m,
             ),
+            sensors=sensor_facts(self._odometry),
             lidars=lidars,
             start=None if start is None else StartFacts(kind=start.kind, text=start.text, duration_s=start.duration_s),
             scans=statistics.count,
@@ -367,7 +369,7 @@ class _Run(ResumableRun[Scan | ImuSamples, Estimate, RunSummary]):
     def _unknown_mounting(self) -> str | None:
         if not self._extrinsic.unknown or not isinstance(self._odometry, LidarInertialOdometry):
             return None
-        return None if self._odometry.mounting_borne_out else self._extrinsic.unknown
+        return None if self._odometry.consistency.mounting_borne_out else self._extrinsic.unknown
 
     @property
     def _mounting_sigma(self) -> tuple[float, float] | None:

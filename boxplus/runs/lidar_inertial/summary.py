@@ -40,6 +40,17 @@ class ExtrinsicFacts(Part):
     sigma_end_m: float | None = Field(None, description="likewise along the worst axis")
 
 
+class ShownFacts(Part):
+    """What the motion has shown of one part of the sensors; see `boxplus.systems.lidar_inertial_agreement.shown.Shown`."""
+
+    part: Literal["gyroscope", "clocks", "mounting", "lengths"]
+    shown: bool = Field(description="whether an error of it would have been named")
+    value: float | None = Field(description="as the sensors show it: a factor (gyroscope, lengths) or seconds (clocks)")
+    std: float | None = Field(description="standard deviation of it; of the mounting's rotation about its worst axis [deg]")
+    unnoticed: float | None = Field(description="how far it may be off without being named; null: any error may")
+    text: str
+
+
 class LidarFacts(Part):
     """One of several LiDARs that were merged; the first one comes first."""
 
@@ -93,6 +104,7 @@ class RunSummary(RunFacts):
         None,
         description="that the run itself does not know where it ends, to a fifth of its way: the `contradiction` if no other",
     )
+    sensors: list[ShownFacts] = Field(default=[], description="what the motion has shown of LiDAR and IMU; empty without an IMU")
     lidars: list[LidarFacts] = Field(default=[], description="of several that were merged; empty for one alone")
     scans: int = 0
     scans_read: int = 0
@@ -114,6 +126,12 @@ class RunSummary(RunFacts):
     def has_imu(self) -> bool:
         """Whether an IMU took part."""
         return self.extrinsic.source != "none"
+
+    @property
+    def not_shown(self) -> str | None:
+        """See `RunFacts.not_shown`."""
+        open_parts = [part.text for part in self.sensors if not part.shown]
+        return "; ".join(open_parts) or None
 
     @property
     def progress(self) -> float:

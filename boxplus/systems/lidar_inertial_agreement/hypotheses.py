@@ -106,6 +106,21 @@ def judges_clocks(rotation: RotationFit) -> bool:
     return _turning(rotation) and rotation.explained > _CLOSELY and rotation.knows_offset
 
 
+def least_offset(rotation: RotationFit, imu_rate_hz: float) -> float:
+    """The smallest offset of the clocks that is named [s]."""
+    return float(max(_OFFSET_OK_S, 0.5 / max(imu_rate_hz, 1.0), 4.0 * rotation.offset_std_s))
+
+
+def judges_scale(rotation: RotationFit) -> bool:
+    """Whether the motion shows the gyroscope's scale."""
+    return _turning(rotation) and rotation.explained > _CLOSELY
+
+
+def least_scale(rotation: RotationFit) -> float:
+    """How far the gyroscope's scale is off at least where it is named."""
+    return float(max(_SCALE_OFF, 4.0 * rotation.scale_std))
+
+
 def judges_lengths(agreement: Agreement) -> bool:
     """Whether the motion shows sign and scale of the accelerations."""
     translation = agreement.translation
@@ -302,9 +317,8 @@ def _least_tilt(planes: PlaneTilt) -> float:
 
 
 def _of_scale(rotation: RotationFit) -> Finding | None:
-    off = abs(rotation.scale - 1.0)
     # The noise of the LiDAR's rates makes a slope too small: where it counts, nothing is said.
-    if not _turning(rotation) or rotation.explained < _CLOSELY or off < max(_SCALE_OFF, 4.0 * rotation.scale_std):
+    if not judges_scale(rotation) or abs(rotation.scale - 1.0) < least_scale(rotation):
         return None
     return Finding(
         "gyro_scale",
@@ -314,9 +328,8 @@ def _of_scale(rotation: RotationFit) -> Finding | None:
 
 
 def _of_clocks(rotation: RotationFit, imu_rate_hz: float) -> Finding | None:
-    allowed = max(_OFFSET_OK_S, 0.5 / max(imu_rate_hz, 1.0))
     offset, std = rotation.offset_s, rotation.offset_std_s
-    if not judges_clocks(rotation) or abs(offset) < max(allowed, 4.0 * std):
+    if not judges_clocks(rotation) or abs(offset) < least_offset(rotation, imu_rate_hz):
         return None
     return Finding(
         "time_offset",

@@ -13,6 +13,7 @@ from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit
 _SLOPE_OFF = 0.07
 _METRES = 0.15  # a scale is 1, where 3.28 is the other choice
 _SLOPE_WELL_KNOWN = 0.033
+_DEVIATIONS, _DEVIATIONS_OF_MANY = 3.0, 2.7
 FEWEST_SLOPES = 2
 _EXPLAINED = 0.8
 SLOPE_FLOOR = 0.02  # of any slope: what no fit knows
@@ -34,7 +35,13 @@ def feet_finding(in_feet: TranslationFit) -> Finding | None:
 
 def lengths_of_many(slopes: Sequence[tuple[float, float]]) -> Finding | None:
     """What several stretches say of the lengths, each by `slope_of`, where none of them decides alone."""
-    return slope_finding(*_mean(slopes), deviations=2.7) if len(slopes) >= FEWEST_SLOPES else None
+    return slope_finding(*_mean(slopes), deviations=_DEVIATIONS_OF_MANY) if len(slopes) >= FEWEST_SLOPES else None
+
+
+def least_factor(slopes: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
+    """The slope of these stretches, its standard deviation, and how far it is off at least where it is named."""
+    slope, std = _mean(slopes) if len(slopes) >= FEWEST_SLOPES else slopes[0]
+    return slope, std, _least(std, _DEVIATIONS_OF_MANY if len(slopes) >= FEWEST_SLOPES else _DEVIATIONS)
 
 
 def lengths_known(slopes: Sequence[tuple[float, float]]) -> bool:
@@ -51,9 +58,13 @@ def _mean(slopes: Sequence[tuple[float, float]]) -> tuple[float, float]:
     return mean, float(np.hypot(np.sqrt(max(scatter, 1.0) / information), SLOPE_FLOOR))
 
 
-def slope_finding(slope: float, std: float, deviations: float = 3.0) -> Finding | None:
+def _least(std: float, deviations: float) -> float:
+    return max(_SLOPE_OFF, deviations * std)
+
+
+def slope_finding(slope: float, std: float, deviations: float = _DEVIATIONS) -> Finding | None:
     """Lengths that are wrong by the slope of the accelerations and its standard deviation; None where they may be right."""
-    if abs(slope - 1.0) < max(_SLOPE_OFF, deviations * std) or std > SLOPE_KNOWN or slope < 0.0:
+    if abs(slope - 1.0) < _least(std, deviations) or std > SLOPE_KNOWN or slope < 0.0:
         return None
     name = " (feet are 3.28)" if abs(slope / FEET_PER_METRE - 1.0) < 0.25 else ""
     return Finding(

@@ -34,6 +34,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twi
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned
 from boxplus.systems.lidar_inertial_agreement.mounting_in_use import mounting_in_use, shows_about
 from boxplus.systems.lidar_inertial_agreement.mountings import Turn, mounting_of_many, turn_from
+from boxplus.systems.lidar_inertial_agreement.shown import Shown, ShownByMotion
 
 Said = TypeVar("Said")
 
@@ -86,6 +87,12 @@ class Watch:
         self._first_with_clocks: Agreement | None = None
         self._slopes: _Stretches[tuple[float, float]] = _Stretches()
         self._turns: _Stretches[Turn] = _Stretches()
+        self._shown = ShownByMotion()
+
+    @property
+    def shown(self) -> tuple[Shown, ...]:
+        """What the motion has shown of the sensors so far, part by part."""
+        return self._shown.parts(self._slopes.said)
 
     def add(
         self,
@@ -157,6 +164,7 @@ class Watch:
         return lambda: compare_sensors(scans, imu, config, T_expected=T_expected, T_declared=T_declared, expected=expected)
 
     def _take_up(self, agreement: Agreement) -> str | None:
+        self._shown.add(agreement)
         findings = contradictions(agreement, self._T_declared)
         if self._T_declared is None and not findings:
             findings = [finding for finding in [mounting_in_use(agreement, self._T_compared)] if finding is not None]

@@ -108,9 +108,9 @@ class LidarInertialOdometry(Snapshots):
         return self._consistency.contradiction or self._gap
 
     @property
-    def mounting_borne_out(self) -> bool:
-        """Whether the motion since the start has shown T_imu_lidar about all axes, and it was the one in use."""
-        return self._consistency.mounting_borne_out
+    def consistency(self) -> Consistency:
+        """How the LiDAR bears out the IMU since the start, and what the motion has shown of both."""
+        return self._consistency
 
     @property
     def time_steps(self) -> list[str]:

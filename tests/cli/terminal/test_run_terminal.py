@@ -48,14 +48,25 @@ def test_the_first_line_says_whether_a_result_is_to_be_trusted(doubt: str | None
 
     What speaks against the odometry alone, such as a position that satellites have shown since, is no doubt about the result.
     """
+    shown, alarms = _results_shown(doubt=doubt)
+    first, other = (shown, alarms) if doubt is None else (alarms, shown)
+    assert first.splitlines()[0] == said and "not to be trusted" not in other
+    assert alarms.count("fixes jump") == 1 and "something else" in alarms  # nothing is said twice
+    assert "not shown" not in shown + alarms
+
+
+def test_what_the_motion_has_not_shown_is_said_after_the_warnings() -> None:
+    shown, alarms = _results_shown(not_shown="lengths")
+    assert "not shown by the motion, so that an error of it would go unnoticed: lengths" in shown and "not shown" not in alarms
+
+
+def _results_shown(*, doubt: str | None = None, not_shown: str | None = None) -> tuple[str, str]:
     terminal, shown, alarms = RunTerminal(), io.StringIO(), io.StringIO()
     terminal.console, terminal.alarms = Console(file=shown, width=140), Console(file=alarms, width=140)
     warnings = [WarningFacts(text=text, count=1) for text in ("fixes jump", "something else")]
     summary = SimpleNamespace(
         state="finished", contradiction="of the odometry alone", status={}, estimates=(9, "scans"), start=None, path_length_m=1.0,
-        length_unit="m", duration_s=1.0, warnings=warnings, describe_progress=lambda: "finished: 9 scans",
+        length_unit="m", duration_s=1.0, warnings=warnings, describe_progress=lambda: "finished: 9 scans", not_shown=not_shown,
     )  # fmt: skip
     terminal.print_results(cast(RunFacts, summary), [], Path("out"), [], doubt=doubt)
-    first, other = (shown, alarms) if doubt is None else (alarms, shown)
-    assert first.getvalue().splitlines()[0] == said and "not to be trusted" not in other.getvalue()
-    assert alarms.getvalue().count("fixes jump") == 1 and "something else" in alarms.getvalue()  # nothing is said twice
+    return shown.getvalue(), alarms.getvalue()

@@ -18,6 +18,7 @@ from boxplus.filtering.nav_state import BA, BW, PL, RL, T_BA, T_BW, TANGENT, P, 
 from boxplus.manifolds import so3
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.shown import Shown
 from boxplus.systems.lidar_inertial_agreement.watch import Watch
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.mounted_update import MountedUpdate
@@ -94,6 +95,11 @@ class Consistency:
     def mounting_borne_out(self) -> bool:
         """Whether the motion has shown the mounting about all axes, and it was the one in use."""
         return self._watch.mounting_borne_out
+
+    @property
+    def shown(self) -> tuple[Shown, ...]:
+        """What the motion has shown of the sensors so far."""
+        return self._watch.shown
 
     @property
     def lost(self) -> bool:
