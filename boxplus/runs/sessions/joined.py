@@ -94,7 +94,7 @@ def doubts_of_joining(alignment: SessionAlignment, doubts: Sequence[str | None],
             found.append(_untrusted(name, doubt))
         if number in scales and not scales[number][1]:
             found.append(scales[number][0])
-    return found + list(dict.fromkeys(text for texts in joins.values() for text in texts))
+    return found + list(dict.fromkeys(text for texts in joins.values() for text in texts)) + alignment.slips(held)
 
 
 def _other_scales(alignment: SessionAlignment) -> dict[int, tuple[str, bool]]:

@@ -37,6 +37,7 @@ class Meeting:
             where the meeting was refused before that was asked.
         refusal: why the two are not joined, in a sentence; None where they are.
         doubt: what is left to doubt where they are, after their names; None where nothing is.
+        slip: where they are, and encounters say that the odometry of one slipped: a sentence; None where nothing says so.
     """
 
     place_session: int
@@ -49,6 +50,7 @@ class Meeting:
     standing: float = math.nan
     refusal: str | None = None
     doubt: str | None = None
+    slip: str | None = None
 
     @property
     def accepted(self) -> list[Encounter]:

@@ -35,6 +35,7 @@ from boxplus.systems.sessions.kind import lead_of
 from boxplus.systems.sessions.open_axis import moved_along, open_axis, shift_along
 from boxplus.systems.sessions.other_alignments import fits_otherwise, other_alignments
 from boxplus.systems.sessions.places import Places
+from boxplus.systems.sessions.slip import slip_of
 from boxplus.systems.slam.consistency import agree, largest_clique
 from boxplus.systems.slam.loop import Floats, Loop
 from boxplus.systems.slam.proposals import Proposal
@@ -143,15 +144,14 @@ class _Meeting:
                 f"are at the same place or at two of a kind: what stands lies only {100.0 * lead.share:.0f} % nearer to surfaces "
                 f"of the other than {lead.over}"
             )
-        against = "contradicts the encounters that agree with each other"
-        final = [
-            loop if loop.refusal is not None or id(loop) in kept else replace(loop, refusal=against)
-            for loop in self.loops.values()
-        ]
+        against = [loop for loop in self.loops.values() if loop.refusal is None and id(loop) not in kept]
+        names = self.place.session.name, self.query.session.name
+        slip = slip_of(encounters, self._largest_agreeing(against), names, joined.T_world_map)
+        why = "contradicts the encounters that agree with each other"
+        final = [replace(loop, refusal=why) if loop in against else loop for loop in self.loops.values()]
         final = [replace(loop, weight=float(loop.refusal is None)) for loop in final]
-        return Meeting(
-            *self.numbers, final, joined.T_world_session[1], joined.covariance[1], predicted, confirmed, share, doubt=doubt
-        )
+        T, covariance = joined.T_world_session[1], joined.covariance[1]
+        return Meeting(*self.numbers, final, T, covariance, predicted, confirmed, share, doubt=doubt, slip=slip)
 
     def _refused(self, why: str, predicted: int = 0, confirmed: int = 0, standing: float = math.nan) -> Meeting:
         return Meeting(*self.numbers, list(self.loops.values()), None, None, predicted, confirmed, standing, why)

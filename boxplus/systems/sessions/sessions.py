@@ -99,6 +99,15 @@ class SessionAlignment:
             if group[number] != own
         }
 
+    def slips(self, held: int) -> list[str]:
+        """Where the odometry of a session of the largest world slipped, in sentences, unless both sessions were held before.
+
+        Other sessions bear out where it is before the slip, or after it, not both.
+        """
+        members = set(self.worlds[0].members)
+        slipped = [(m.slip, {m.place_session, m.query_session}) for m in self.meetings if m.refusal is None]
+        return [text for text, pair in slipped if text is not None and pair <= members and max(pair) >= held]
+
 
 def align_sessions(
     sessions: Sequence[Session],
