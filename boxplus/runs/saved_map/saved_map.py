@@ -27,8 +27,11 @@ from boxplus.runs.saved_map.places import along, over_ground
 from boxplus.runs.saved_map.tiled_points import TiledPoints
 from boxplus.runs.storage.output_folder import doubts_of, program_of
 
+_SPREAD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
+_MARKER = 1e18  # m, and beyond: no coordinates
 _ROUNDING = 0.01  # m, by which a point may lie outside of its tile
 _TILE = 32.0  # m, in memory, of a cloud from a file
+_ALONE_M, _MOST_ALONE, _FEWEST = 2.0, 0.9, 1000  # points alone in a cube of such an edge show no surface; share, and number
 _WHAT = "a folder of 'boxplus lio', 'slam' or 'map merge', a map folder with tiles, or a PLY, PCD, LAS, LAZ or E57 file"
 
 _MAKE_ONE = "make a map of it by 'boxplus slam', and give its output folder"
@@ -192,6 +195,7 @@ def _of_file(path: Path, voxel: float, damage: list[str]) -> tuple[TiledPoints, 
     else:
         cloud = read_cloud(path)
     points = cloud.points[np.isfinite(cloud.points).all(axis=1)]
+    _refuse_another_unit(path, points)
     # A few are markers of no return (1e30); all of them are of a map projection, and lost their digits as they were written.
     is_near = (np.abs(points) <= FARTHEST_M).all(axis=1)
     if far := len(points) - int(np.count_nonzero(is_near)):
@@ -209,3 +213,25 @@ def _of_file(path: Path, voxel: float, damage: list[str]) -> tuple[TiledPoints, 
         points = points[is_near]
     tiles = dict(split_by_tile(points[first_per_voxel(points, voxel)], _TILE))
     return TiledPoints(tiles, _TILE, lambda index: tiles[index]), origin
+
+
+def _refuse_another_unit(path: Path, points: NDArray[np.float32]) -> None:
+    """Surfaces in metres have many points in a cube of 2 m; in millimetres, and mostly in centimetres, each is alone in its own.
+
+    Asked before anything else: such a site reaches farther than float32 is good for, and has a tile for every point.
+    """
+    seen = points[(np.abs(points) < _MARKER).all(axis=1)]
+    if len(seen) < _FEWEST:
+        return
+    cubes = np.floor(seen.astype(np.float64) / _ALONE_M).astype(np.int64).view(np.uint64)
+    x, y, z = (cubes[:, k] * _SPREAD[k] for k in range(3))  # sums that wrap around: two cubes share one about never
+    alone = len(np.unique(x + y + z)) / len(seen)
+    if alone <= _MOST_ALONE:
+        return
+    low, high = np.percentile(seen, [1.0, 99.0], axis=0)
+    extent = " x ".join(f"{width:.0f}" for width in high - low)
+    raise InputError(
+        f"a cloud in metres, with surfaces of many points in a cube of {_ALONE_M:g} m",
+        f"{100.0 * alone:.0f} % as many such cubes as points, in a cloud of {extent} m ({path})",
+        "multiply it by 0.001 where it is in millimetres, by 0.01 in centimetres; else give one with more points",
+    )

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
@@ -20,8 +22,9 @@ from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.visibility import visible
+from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.maps.tiles.writer import TileWriter
-from boxplus.runs.saved_map.saved_map import SavedMap, open_saved_map
+from boxplus.runs.saved_map.saved_map import SavedMap, _refuse_another_unit, open_saved_map
 
 CONFIG = LocalMapConfig(length=8.0, voxel=0.25, max_range=30.0)
 
@@ -140,6 +143,27 @@ def test_a_cloud_whose_digits_were_lost_is_refused(tmp_path: Path) -> None:
     write_ply(tmp_path / "utm.ply", two_rooms() + np.array([5e5, 5.4e6, 0.0]))
     with pytest.raises(InputError, match=r"points farther away, up to 54000\d\d m, which it holds to 0\.5 m .*utm\.ply"):
         open_saved_map(tmp_path / "utm.ply", CONFIG)
+
+
+@pytest.mark.parametrize(("factor", "spread"), [(1e3, 0.0), (1e2, 0.0), (1e4, 0.0), (1e3, 5e5)])
+def test_a_cloud_in_millimetres_or_centimetres_is_refused_by_that(tmp_path: Path, factor: float, spread: float) -> None:
+    """Whatever its origin, and before anything is computed of it: each of its points would be a tile."""
+    write_ply(tmp_path / "scan.ply", factor * two_rooms() + spread)
+    with pytest.raises(
+        InputError, match=r"points in a cube of 2 m .* in a cloud of .* m \(.*scan\.ply\).* 0\.001 .* millimetres"
+    ):
+        open_saved_map(tmp_path / "scan.ply", CONFIG)
+
+
+@given(seed=st.integers(0, 2**32 - 1), spacing=st.floats(0.2, 1.6))
+@settings(max_examples=25)
+def test_a_cloud_as_coarse_as_is_of_any_use_is_none_of_these(seed: int, spacing: float) -> None:
+    """Rooms that are scanned every 0.2 to 1.6 m (half a metre is 1.6 ft), of any origin, and markers of no return."""
+    random = np.random.default_rng(seed)
+    rooms = np.concatenate([two_rooms() + np.float32([x, y, 0.0]) for x in 30.0 * np.arange(5) for y in (0.0, 30.0)])
+    points = rooms[first_per_voxel(rooms, spacing)] + random.uniform(-1e3, 1e3, 3)
+    assert len(points) >= 1000
+    _refuse_another_unit(Path("map.ply"), random.permutation(np.concatenate([points, np.full((10, 3), 3e38)]).astype(np.float32)))
 
 
 def test_missing_tiles_are_counted(tmp_path: Path) -> None:
