@@ -27,7 +27,7 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
 from boxplus.systems.lidar_inertial_agreement.lengths import least_factor
 from boxplus.systems.lidar_inertial_agreement.mountings import turn_from
 
-_LENGTHS_SHOWN = 0.15  # a factor of as much is named
+_LENGTHS_SHOWN = 0.1  # a factor of as much is named
 _DEVIATIONS = 3.0
 
 Part = Literal["gyroscope", "clocks", "mounting", "lengths"]
@@ -122,11 +122,11 @@ def _of_lengths(slopes: Sequence[tuple[float, float]]) -> Shown:
         text = "lengths: points too long or too short by any factor"
         return Shown("lengths", False, None, None, None, text)
     value, std, least = least_factor(slopes)
+    said = f"the LiDAR's accelerations are {value:.2f} ± {std:.2f} times the accelerometer's"
     if least > _LENGTHS_SHOWN:
-        text = f"lengths: points too long or too short by less than {least:.0%}"
+        text = f"lengths: points too long or too short by less than {least:.0%} ({said})"
         return Shown("lengths", False, value, std, least, text)
-    text = f"the LiDAR's accelerations are {value:.2f} ± {std:.2f} times the accelerometer's, so that points are in metres"
-    return Shown("lengths", True, value, std, least, text)
+    return Shown("lengths", True, value, std, least, f"{said}; lengths that are off by {least:.0%} would have been named")
 
 
 def _surer(before: tuple[float, float, float] | None, now: tuple[float, float, float]) -> tuple[float, float, float]:

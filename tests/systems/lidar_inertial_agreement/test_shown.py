@@ -88,7 +88,7 @@ def test_axes_are_shown_by_one_stretch_each(walk: tuple[Simulation, Agreement]) 
 def test_lengths_are_named_beyond_what_goes_unnoticed(slopes: list[tuple[float, float]], sign: float) -> None:
     lengths = ShownByMotion().parts(slopes)[3]
     assert lengths.unnoticed is not None and lengths.value is not None and lengths.std is not None
-    assert lengths.shown == (lengths.unnoticed <= 0.15)
+    assert lengths.shown == (lengths.unnoticed <= 0.1)
     for factor, named in ((1.05, True), (0.95, False)):
         moved = [(slope + 1.0 - lengths.value + sign * factor * lengths.unnoticed, std) for slope, std in slopes]
         finding = lengths_of_many(moved) if len(moved) > 1 else slope_finding(*moved[0])
