@@ -26,6 +26,7 @@ from boxplus.runs.localization.folder import LocalizationFolder, claim_localizat
 from boxplus.runs.localization.logs import LocalizationLog, SearchLog, candidate_texts
 from boxplus.runs.localization.summary import LocalizationSummary
 from boxplus.runs.run_loop import Progress, versions
+from boxplus.runs.saved_map.other_readings import other_reading
 from boxplus.runs.saved_map.saved_map import SavedMap
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.localization.localizer import Localization, Localizer
@@ -91,7 +92,12 @@ def run_localization(
             recording, own.odometry.path, config.of_odometry(), extrinsic=extrinsic, overwrite=overwrite, progress=progress,
             view=beside, should_stop=should_stop,
         )  # fmt: skip
-        summary = _summary(started, recording, odometry, saved, beside, accept_doubts)
+        reading = None
+        if beside.found_ns is None and odometry.contradiction_of_sensors is None:
+            if progress is not None:
+                progress(Progress(1.0, 0, "scans", "", stage="reading the map in other ways"))
+            reading = other_reading(saved, localizer, config.local_maps)
+        summary = _summary(started, recording, odometry, saved, beside, accept_doubts, reading)
         summary.write(own.summary)
     return LocalizationResult(summary, odometry, saved)
 
@@ -154,7 +160,13 @@ class _Beside:
 
 
 def _summary(
-    started: datetime, recording: Recording, odometry: RunSummary, saved: SavedMap, beside: _Beside, accept_doubts: bool
+    started: datetime,
+    recording: Recording,
+    odometry: RunSummary,
+    saved: SavedMap,
+    beside: _Beside,
+    accept_doubts: bool,
+    reading: str | None,
 ) -> LocalizationSummary:
     search = beside.localizer.last_search
     warnings = [printable(f"the map is damaged: {text}") for text in saved.damage]
@@ -168,6 +180,8 @@ def _summary(
         why = "nothing was collected for long enough to be looked for" if search is None else search.verdict
         if odometry.contradiction_of_sensors is not None:
             why = f"{why or 'see losses'}; sensors contradict each other, and what they saw may fit nowhere: repair that first"
+        if reading is not None:
+            why = reading
         warnings.append(f"{never}: {why or 'see losses'}")
     return LocalizationSummary(
         versions=versions("rosbags"),

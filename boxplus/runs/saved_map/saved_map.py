@@ -71,6 +71,16 @@ class SavedMap:
         """(N, 3) float32 points within `radius` [m] of `centre` (3,), in the map's frame; tiles are read as they are needed."""
         return self._points.near(centre, radius)
 
+    def all_points(self, most: int) -> NDArray[np.float32] | None:
+        """(N, 3) float32, all of them; None where there are more than `most`."""
+        found, count = [np.zeros((0, 3), np.float32)], 0
+        for index in self._points.tiles:
+            found.append(self._points.tile(index))
+            count += len(found[-1])
+            if count > most:
+                return None
+        return np.concatenate(found)
+
 
 def open_saved_map(path: str | Path, config: LocalMapConfig | None = None) -> SavedMap:
     """Open the folder of a run or of a joint map, a folder with map tiles, or a PLY, PCD, LAS, LAZ or E57 file, as a map.

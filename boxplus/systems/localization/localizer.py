@@ -64,6 +64,15 @@ class Search:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Asked:
+    """What was looked for: scans together, the newest one alone [body at its time], and its pose in the local map (7,)."""
+
+    local_map: LocalMap
+    scan: NDArray[np.float32]
+    T_query_body: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Localization:
     """What is known of one scan.
 
@@ -92,7 +101,7 @@ class Localizer:
         config: settings; each has a default.
 
     Attributes:
-        last_search: the newest query.
+        last_search: the newest query; last_query: what it asked for, None before one had points.
         losses: how often the place was lost; lost_because: why last, None before it was.
         stays: whether the places agree with each other.
         lengths: whether the map has the lengths that are seen.
@@ -103,6 +112,7 @@ class Localizer:
     def __init__(self, place_map: PlaceMap, config: LocalizationConfig | None = None) -> None:
         self.config = as_settings(LocalizationConfig, config)
         self.last_search: Search | None = None
+        self.last_query: Asked | None = None
         self.lost_because: str | None = None
         self.losses = 0
         self.stays = Stays()
@@ -171,6 +181,16 @@ class Localizer:
         self._tracker.predict(step, seconds)
         return self._follow(self._tracker, int(time_ns), T_odo, points, up, lost)
 
+    def believes(self, asked: Asked) -> Candidate | None:
+        """The place of a query that this map is believed to have, at once and by itself; None where there is none."""
+        candidates = self._candidates(asked.local_map, asked.T_query_body, asked.scan, [])
+        if not candidates:
+            return None
+        candidates.sort(key=lambda candidate: (candidate.refusal is not None, -candidate.fit))
+        best, verdict, _ = rivalry(candidates, self.config)
+        is_believed = best is not None and not verdict and lead(best, candidates) >= self.config.least_lead
+        return best if is_believed else None
+
     def _search(self, time_ns: int, T_odo: Floats, points: NDArray[np.float32], up: Floats | None) -> Localization:
         """Collect scans; look for what has been collected."""
         search = None
@@ -186,6 +206,7 @@ class Localizer:
         candidates: list[Candidate] = []
         verdict = "the scans have no points"
         if len(local_map.points):
+            self.last_query = Asked(local_map, scan, T_query_body)
             # What fitted before is asked again: a place that the search misses once stays a rival.
             earlier = [Guess(place, se3.compose(T, local_map.T_odo_map), 0.0) for place, T in self._earlier]
             candidates = self._candidates(local_map, T_query_body, scan, earlier)

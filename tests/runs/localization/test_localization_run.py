@@ -159,6 +159,15 @@ def test_in_the_map_of_another_place_there_is_no_pose(mapped: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
+def test_a_mirrored_map_is_named(mapped: Path, tmp_path: Path) -> None:
+    write_ply(tmp_path / "mirrored.ply", read_ply(mapped / "map.ply").points * np.array([1.0, -1.0, 1.0], np.float32))
+    summary = run(as_recording(drive(((-12.0, 0.0), (8.0, 0.0)), seed=4)), tmp_path / "out", tmp_path / "mirrored.ply").summary
+    assert summary.found_after_s is None and summary.T_map_world is None
+    (why,) = (text for text in summary.warnings if text.startswith("not found"))
+    assert re.fullmatch(r"not found: read mirrored, the map has what was seen \(\d+ % of what stands\): give one of .*", why)
+
+
+@pytest.mark.slow
 def test_in_a_joint_map_places_come_from_its_sessions(tmp_path: Path) -> None:
     """Once it was a bare cloud, with hundreds of places on a grid over its ground."""
     world, drift = city(2, 2, seed=5), DriftConfig(channels=16, azimuth_steps=240, step_m=2.0)
