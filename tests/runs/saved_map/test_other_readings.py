@@ -1,4 +1,4 @@
-"""A cloud in feet, mirrored, or lying on a side has the place that is seen, read as what it is; that of another place has none."""
+"""A cloud in feet, mirrored or lying on a side has the place that is seen, read as what it is; one of another place has none."""
 
 from __future__ import annotations
 
