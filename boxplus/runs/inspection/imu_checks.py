@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from boxplus.recordings.imu_units import STANDARD_GRAVITY
 from boxplus.recordings.info import Evidence
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.imu_saturation import limits_of
 from boxplus.sensors.imu_values import beyond, empty, finite, glitches
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
 
@@ -21,8 +22,6 @@ _SLOWEST_FOR_REST_HZ = 40.0
 """A slower IMU misses the vibration that tells a smooth drive from a standstill."""
 _LARGEST_BIAS_RAD_S = 0.15
 _GRAVITY_OFF = 0.03
-_SATURATED_GYRO = 4.0
-_SATURATED_ACCEL = 25.0
 _REPEATED, _REPEATED_S = 20, 0.2  # samples and their time
 
 
@@ -118,17 +117,12 @@ def _gravity(accel: NDArray[np.float64], source: str) -> Evidence:
 
 
 def check_saturation(imu: ImuSamples) -> Evidence:
-    """Samples that sit at one and the same extreme value in a row."""
-    found = []
-    for name, values, floor in (("gyro", imu.gyro, _SATURATED_GYRO), ("accel", imu.accel, _SATURATED_ACCEL)):
-        peak = np.nanmax(np.abs(values), axis=0, initial=0.0)
-        at_peak = (np.abs(values) >= 0.9999 * peak) & (peak > floor)
-        clipped = (at_peak[1:] & at_peak[:-1]).sum(axis=0)
-        found += [
-            f"{name} {axis}: {count + 1} samples at {top:.2f}"
-            for axis, count, top in zip("xyz", clipped, peak, strict=True)
-            if count >= 2
-        ]
+    """Samples that sit at a limit of their sensor, see `Saturation`."""
+    imu = imu.in_order()
+    samples: dict[str, int] = {}
+    for limit in limits_of(imu):  # either way along an axis has one
+        samples[limit.text] = samples.get(limit.text, 0) + int(limit.reached(imu).sum())
+    found = [f"{text} in {count} samples" for text, count in samples.items()]
     if found:
         text = f"{'; '.join(found)}: the sensor's range is exceeded and motion is lost there; use a wider range"
         return Evidence("imu_saturation", "saturated", "warning", text)

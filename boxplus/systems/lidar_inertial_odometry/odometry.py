@@ -22,6 +22,7 @@ from boxplus.maps.sliding_box import SlidingBox
 from boxplus.sensors.deskew import deskew_into
 from boxplus.sensors.downsampling import VoxelFilter
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.imu_saturation import Saturation
 from boxplus.sensors.scan import Scan
 from boxplus.sensors.sequencer import AFTER_GAP, BEFORE_START, Frame, Sequencer, joined_imu
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import align
@@ -44,7 +45,6 @@ from boxplus.systems.lidar_inertial_odometry.start.unstarted import UnstartedSca
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
 from boxplus.systems.lidar_inertial_odometry.watches.long_baseline import LongBaseline
-from boxplus.systems.lidar_inertial_odometry.watches.saturation import Saturation
 from boxplus.systems.lidar_inertial_odometry.watches.weak_spell import WeakSpell
 
 _LONGEST_START_SCANS, _FEWEST_NEW = 30, 0.3  # scans that a start may take, share of them that is new in every try
@@ -286,7 +286,8 @@ class LidarInertialOdometry(Snapshots):
     def _propagate(self, frame: Frame) -> NDArray[np.float32]:
         """Forward through the IMU samples to the end of the scan; every point is moved to that instant."""
         self._x_before = self._x.copy()
-        self._warnings = self._saturation.update(frame.imu)
+        saturated = dict.fromkeys(limit.text for limit in self._saturation.update(frame.imu))
+        self._warnings = [f"{text}: motion beyond it is not measured, covariance widened" for text in saturated]
         density = self._noise.update(frame.imu)
         if self._warnings:
             density = np.maximum(density, _SATURATED_DENSITY)

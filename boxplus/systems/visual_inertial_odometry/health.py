@@ -6,11 +6,13 @@ was seen for longer than the IMU holds the pose. A contradiction that lasts is r
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.sensors.imu_saturation import Limit
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.partners import FLAT, LEAST_SHARE, few_are_found
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
@@ -53,7 +55,14 @@ class Health:
         self._seen_ns = self._agreed_ns = time_ns
 
     def judge(
-        self, tracks: Tracks, fit: Fit, rests: bool, imu_gap_s: float, position_sigma: float, apart: str | None = None
+        self,
+        tracks: Tracks,
+        fit: Fit,
+        rests: bool,
+        imu_gap_s: float,
+        position_sigma: float,
+        apart: str | None = None,
+        limits: Sequence[Limit] = (),
     ) -> tuple[Status, tuple[str, ...]]:
         """The status of a frame, and why it is not "ok".
 
@@ -62,6 +71,7 @@ class Health:
             imu_gap_s: longest time between IMU samples before the frame [s].
             position_sigma: standard deviation of the position, all axes together [m].
             apart: how the way of the cameras and the IMU's contradict each other; None where they do not.
+            limits: of the IMU, which its samples before the frame reach.
         """
         time_ns, reasons = tracks.time_ns, []
         agreed = fit.agreed + fit.lines.agreed
@@ -90,6 +100,7 @@ class Health:
                     f"a gap of {imu_gap_s:.2f} s in the IMU, and too little was seen across it: the way meanwhile is known to "
                     f"{position_sigma:.1f} m, and the poses before and after it do not belong together"
                 )
+        reasons += dict.fromkeys(f"{limit.text}: motion beyond it is not measured" for limit in limits)
         contradictions = self._contradictions(tracks, fit) + ([] if apart is None else [apart])
         if not contradictions:
             self._agreed_ns = time_ns

@@ -10,7 +10,7 @@ Source: Qin, Li and Shen, VINS-Mono, TRO 2018; Leutenegger et al., OKVIS, IJRR 2
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, overload
 
@@ -27,6 +27,7 @@ from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.glitch_filter import GlitchFilter
 from boxplus.sensors.gyro_attitude import GyroAttitude
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.imu_saturation import Limit, Saturation
 from boxplus.sensors.imu_values import measurements
 from boxplus.sensors.repeated_images import RepeatedImages
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
@@ -104,6 +105,7 @@ class VisualInertialOdometry:
         self._time_ns = 0  # of the frame before
         self._health = Health(self.config)
         self._watch = InertialWatch(self.config.gravity)
+        self._saturation = Saturation()
         self._focal_watch = FocalWatch(self.rig, self.config.pixel_sigma)
         self._counters: Counter[str] = Counter()
 
@@ -246,9 +248,10 @@ class VisualInertialOdometry:
         return len(around) == 2 and 1e-9 * float(around[1] - around[0]) > self.config.max_imu_gap
 
     def _frame(self, time_ns: int, images: dict[int, NDArray[Any]]) -> VioEstimate:
+        limits = self._limits_reached(time_ns)
         if self.start is None:
             return self._before_start(time_ns, images)
-        pose, state = self.window.predict(time_ns, self._imu)
+        pose, state = self.window.predict(time_ns, self._imu, is_clipped=bool(limits))
         before = self.window.bodies.values[-1]
         R = quaternion.to_matrix(before[:4]).T
         R_before_now, p_before_now = R @ quaternion.to_matrix(pose[:4]), R @ (pose[4:] - before[4:])
@@ -268,7 +271,7 @@ class VisualInertialOdometry:
         self._tracker.forget(fit.given_up)
         if self._line_tracker is not None:
             self._line_tracker.forget(fit.lines.given_up)
-        estimate = self._estimate(tracks, is_keyframe, fit, rests)
+        estimate = self._estimate(tracks, is_keyframe, fit, rests, limits)
         self.window.shrink()
         self._forget_imu(self.window.frames[0].time_ns)
         return estimate
@@ -278,6 +281,11 @@ class VisualInertialOdometry:
         first = max(int(np.searchsorted(self._imu.time_ns, self._time_ns, side="right")) - 1, 0)
         around = self._imu.time_ns[first : int(np.searchsorted(self._imu.time_ns, time_ns)) + 1]
         return 1e-9 * float(np.diff(around).max(initial=0))
+
+    def _limits_reached(self, time_ns: int) -> list[Limit]:
+        """Limits of the IMU that its samples from the frame before to this one reach."""
+        first, last = np.searchsorted(self._imu.time_ns, [self._time_ns + self.window.cut_ns, time_ns + self.window.cut_ns])
+        return self._saturation.update(self._imu.where(slice(int(first), int(last) + 1)))
 
     def _rate(self, time_ns: int) -> NDArray[np.float64]:
         """Angular velocity (3,) that the gyroscope measured at a time of the cameras' clock [rad/s]."""
@@ -347,7 +355,7 @@ class VisualInertialOdometry:
             timing_s={},
         )
 
-    def _estimate(self, tracks: Tracks, is_keyframe: bool, fit: Fit, rests: bool) -> VioEstimate:
+    def _estimate(self, tracks: Tracks, is_keyframe: bool, fit: Fit, rests: bool, limits: Sequence[Limit] = ()) -> VioEstimate:
         pose, state = self.window.bodies.values[-1], self.window.states.values[-1]
         ids, landmarks, sigmas = self.window.landmarks()
         line_ids, line_ends = self.window.lines.ends(self.window.bodies, self.window.mountings.values)
@@ -357,7 +365,7 @@ class VisualInertialOdometry:
         if is_keyframe:
             self._focal_watch.add(tracks)
         sigma, apart = position_sigma(covariance), self._focal_watch.contradiction or self._watch.contradiction
-        status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, sigma, apart)
+        status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, sigma, apart, limits)
         return VioEstimate(
             time_ns=tracks.time_ns,
             status=status,

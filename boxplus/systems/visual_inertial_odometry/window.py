@@ -59,7 +59,7 @@ class Window:
         lines: landmarks that are lines.
         offset: of the clocks, IMU minus camera [s]; `cut_ns` of it is in the intervals of the IMU.
         gap_s: longest time between IMU samples before the newest frame [s].
-        last_step: what the IMU measured from the frame before to the newest one; None where it was silent.
+        last_step: what the IMU measured from the frame before to the newest one; None where it was silent, or at its limit.
         frames: in order of time.
         covariance: (15, 15) of the newest frame, [θ, p, v, b_ω, b_a].
         leak: what the last prior claims to know of position and yaw.
@@ -91,6 +91,7 @@ class Window:
         self.frames: list[Frame] = []
         self._imu: Preintegration | None = None
         self.last_step: Preintegration | None = None
+        self._is_clipped = False  # samples before the newest frame reach a limit of the IMU
         self._next: tuple[int, Preintegration] | None = None  # the step from the newest frame that `predict` took, and its end
         self._imu_group: Group | None = None
         self._views: tuple[Group, NDArray[np.intp]] | None = None  # residuals of the observations, and which they are
@@ -117,9 +118,9 @@ class Window:
         self.lines.disconnect()
         return {name: value for name, value in vars(self).items() if name not in _GIVEN}
 
-    def predict(self, time_ns: int, imu: ImuSamples) -> tuple[Floats, Floats]:
-        """Pose (7,) and [v, b_a, b_g] (9,) at a time, from the newest frame and the IMU."""
-        step = self._step(time_ns, imu)
+    def predict(self, time_ns: int, imu: ImuSamples, *, is_clipped: bool = False) -> tuple[Floats, Floats]:
+        """Pose (7,) and [v, b_a, b_g] (9,) at a time, by the newest frame and the IMU, which may be at its limit."""
+        step, self._is_clipped = self._step(time_ns, imu), is_clipped
         self._next = time_ns, step
         pose, state = step.predict(self.bodies.values[-1], self.states.values[-1], self._gravity)
         return pose[0], state[0]
@@ -157,7 +158,7 @@ class Window:
             self._next = None
             self._imu = step if self._imu is None else self._imu.append(step)
             self.gap_s = float(step.longest_gap_s[0])
-            self.last_step = step if self.gap_s <= self._config.max_imu_gap else None
+            self.last_step = step if self.gap_s <= self._config.max_imu_gap and not self._is_clipped else None
         number = int(self.problem.extend(self.bodies, pose).ids[0])
         self.problem.extend(self.states, state)
         self.frames.append(Frame(number, tracks.time_ns, tracks, is_keyframe))

@@ -206,7 +206,7 @@ def test_saturation() -> None:
     still = np.tile([0.0, 0.0, 9.81], (400, 1))
     assert check_saturation(ImuSamples(time_ns, gyro, still)).verdict == "ok"
     clipped = check_saturation(ImuSamples(time_ns, np.clip(gyro, -4.36, 4.36), still))
-    assert clipped.verdict == "warning" and "gyro x:" in clipped.text and "4.36" in clipped.text
+    assert clipped.verdict == "warning" and "gyroscope x saturated at 4.36 rad/s" in clipped.text and "4.36" in clipped.text
 
 
 def steady(rate_hz: int) -> ImuSamples:

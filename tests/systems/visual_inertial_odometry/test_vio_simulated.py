@@ -164,6 +164,17 @@ def test_a_silent_imu_is_bridged_by_the_images_taken_meanwhile(cameras: int) -> 
         assert error @ np.linalg.solve(covariance, error) < chi2.ppf(0.999, 4)
 
 
+@pytest.mark.parametrize("limit", [0.55, 0.7, np.inf])
+def test_frames_whose_samples_sit_at_the_limit_of_the_gyroscope_are_weak_and_say_so(limit: float) -> None:
+    flight = Flight(705, 5.0)
+    clipped = (np.abs(flight.gyro) > limit).any(axis=1)
+    flight.gyro = np.clip(flight.gyro, -limit, limit)
+    _, estimates = run(flight, rig(), CONFIG)
+    told = [e for e in estimates if any(f"saturated at {limit:.2f} rad/s" in reason for reason in e.reasons)]
+    assert all(e.status != "ok" and clipped[max(at(flight, e) - 11, 0) : at(flight, e) + 2].any() for e in told)
+    assert len(told) > 10 if clipped.any() else not any("saturated" in reason for e in estimates for reason in e.reasons)
+
+
 @pytest.mark.parametrize(("begin_s", "end_s"), [(0.22, 0.9), (0.0, 0.6)])
 def test_no_start_reaches_across_a_silent_imu(begin_s: float, end_s: float) -> None:
     """The samples are missing between two frames that wait for a start: those before it are of no use, and nothing breaks."""

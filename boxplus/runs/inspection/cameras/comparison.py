@@ -17,7 +17,7 @@ from boxplus.runs.inspection.cameras.carried import Followed, check_carried
 from boxplus.runs.inspection.cameras.focal_length import check_focal_length
 from boxplus.runs.inspection.cameras.known_turns import known_turns
 from boxplus.runs.inspection.cameras.readout import check_readout
-from boxplus.runs.inspection.cameras.rotation import Turns, align, check_rotation
+from boxplus.runs.inspection.cameras.rotation import Turns, align, check_rotation, measured_turns
 from boxplus.runs.inspection.cameras.stereo import Corners, check_baseline, check_calibration
 from boxplus.runs.inspection.cameras.tracking import Turned, follow, rotation_between
 from boxplus.sensors.camera_image import CameraImage
@@ -94,7 +94,8 @@ class Comparison:
         if not self._pictures:
             return []
         camera = self._pictures[0]
-        aligned = align(self.turns, imu)
+        turns = measured_turns(self.turns, imu)
+        aligned = align(turns, imu)
         found = check_rotation(camera, aligned)
         carried = check_carried(camera, self._followed, imu)
         if carried:  # which explains why both turn unlike
@@ -102,6 +103,6 @@ class Comparison:
         if isinstance(aligned, str) or camera.model is None or any(e.value == "unlike" for e in found):
             return found
         if np.isfinite(aligned.offset_std_s):  # otherwise the clocks are so far apart that no turn is known
-            turns, *apart = (known_turns(camera, self.turns, imu, aligned, side) for side in (0.0, -1.0, 1.0))
-            found += [check_readout(camera, turns, apart), check_focal_length(camera, turns)]
+            known, *apart = (known_turns(camera, turns, imu, aligned, side) for side in (0.0, -1.0, 1.0))
+            found += [check_readout(camera, known, apart), check_focal_length(camera, known)]
         return found

@@ -10,7 +10,7 @@ of the rotation is σ² (Σ −[c_k]ₓ²)⁻¹.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from boxplus.manifolds.nearest_rotation import nearest_rotation
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence, Verdict
 from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.imu_saturation import limits_of
 
 _SEARCH_S = 0.15
 _STEP_S = 0.001
@@ -107,6 +108,27 @@ class Alignment:
     unlike: float
     rotation_std: float
     instead: str = ""
+
+
+def measured_turns(turns: Turns, imu: ImuSamples) -> Turns:
+    """Those that the gyroscope measured: without a sample at its limit meanwhile, whatever the offset of the clocks."""
+    imu = imu.in_order()
+    limits = [limit for limit in limits_of(imu) if limit.of_gyro]
+    if not limits:
+        return turns
+    missed_ns = imu.time_ns[np.any([limit.reached(imu) for limit in limits], axis=0)]
+    spare_ns = round(1e9 * _SEARCH_S)
+    first = np.searchsorted(missed_ns, np.array(turns.begin_ns) - spare_ns)
+    last = np.searchsorted(missed_ns, np.array(turns.end_ns) + spare_ns)
+    kept = np.flatnonzero(first == last)
+    return replace(
+        turns,
+        begin_ns=[turns.begin_ns[k] for k in kept],
+        end_ns=[turns.end_ns[k] for k in kept],
+        rotation=[turns.rotation[k] for k in kept],
+        before=[turns.before[k] for k in kept],
+        after=[turns.after[k] for k in kept],
+    )
 
 
 def align(turns: Turns, imu: ImuSamples) -> Alignment | str:

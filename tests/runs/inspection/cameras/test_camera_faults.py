@@ -20,7 +20,7 @@ from boxplus.runs.inspection.cameras.examination import examine_cameras
 from boxplus.runs.inspection.cameras.focal_length import check_focal_length, estimate_focal_length
 from boxplus.runs.inspection.cameras.known_turns import KnownTurn, known_turns
 from boxplus.runs.inspection.cameras.readout import check_readout, estimate_readout
-from boxplus.runs.inspection.cameras.rotation import Turns, align
+from boxplus.runs.inspection.cameras.rotation import Turns, align, measured_turns
 from boxplus.runs.inspection.cameras.stereo import Corners, check_calibration
 from boxplus.runs.inspection.cameras.views import Views, check_blur, check_corners, check_views
 from boxplus.sensors.camera_image import CameraImage
@@ -124,6 +124,20 @@ def test_an_offset_of_the_clocks_that_is_hardly_known_is_no_rolling_shutter(seed
     assert abs(found.time_s - readout_s) < 4.0 * found.std_s + 1e-3
     assert abs(found.time_s - readout_s) < 0.5 * abs(pulled.time_s - readout_s)
     assert (check_readout(camera, known, apart).verdict == "warning") == (readout_s != 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [0.55, 0.65])
+def test_turns_beyond_the_limit_of_the_gyroscope_are_no_wrong_focal_length(limit: float) -> None:
+    simulation, turns, imu = turning(3, 0.0)
+    camera = streams(simulation.scenario.rig)[0]
+    clipped = ImuSamples(imu.time_ns, np.clip(imu.gyro, -limit, limit), imu.accel)
+    assert measured_turns(turns, imu) is turns
+    kept = measured_turns(turns, clipped)
+    assert len(kept.rotation) < len(turns.rotation)
+    aligned = align(kept, clipped)
+    if not isinstance(aligned, str):
+        assert check_focal_length(camera, known_turns(camera, kept, clipped, aligned)).verdict == "ok"
 
 
 @given(st.integers(0, 2**32 - 1))

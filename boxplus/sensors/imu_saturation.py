@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.sensors.imu import ImuSamples
 
-_MEMORY = 20  # scans
+_MEMORY = 20  # blocks
+_BLOCK_NS = 100_000_000  # of samples that are looked at as a whole
 _LEAST_SPREAD = np.array([0.5, 0.5, 0.5, 1.5, 1.5, 1.5])  # rad/s, m/s²: at rest quantised values repeat as well
 _SAME = 1e-6  # of the largest value
 _PLATEAU = 3  # samples in a row
@@ -17,6 +19,33 @@ _LONG = 6  # of them: 4 at most at the top of a smooth motion, real and quantise
 _ENOUGH = 2  # plateaus: what is as large as nothing before may round to the same three times, but not there again
 _MOST_STEPS = 2.5  # of the sensor, by which the rounded top of a motion is reached
 _NAMES = ("gyroscope x", "gyroscope y", "gyroscope z", "accelerometer x", "accelerometer y", "accelerometer z")
+
+
+class Limit(NamedTuple):
+    """Of an axis, either way along it.
+
+    Attributes:
+        way: 0 to 5 along the axes of gyroscope and accelerometer, 6 to 11 against them.
+        value: that is not exceeded [rad/s, m/s²].
+    """
+
+    way: int
+    value: float
+
+    @property
+    def text(self) -> str:
+        """Such as "gyroscope x saturated at 4.36 rad/s"."""
+        return f"{_NAMES[self.way % 6]} saturated at {self.value:.2f} {'rad/s' if self.of_gyro else 'm/s²'}"
+
+    @property
+    def of_gyro(self) -> bool:
+        """Whether it is one of angular velocity."""
+        return self.way % 6 < 3
+
+    def reached(self, imu: ImuSamples) -> NDArray[np.bool_]:
+        """(N,) which samples sit there, or beyond."""
+        along = np.hstack([imu.gyro, imu.accel])[:, self.way % 6]
+        return np.asarray((along if self.way < 6 else -along) >= self.value * (1.0 - _SAME))
 
 
 class Saturation:
@@ -36,13 +65,13 @@ class Saturation:
         self._peak, self._step = np.zeros(ways), np.full(2, np.inf)  # of gyroscope and accelerometer
         self._plateaus, self._run, self._cut_off = np.zeros(ways, np.int64), np.zeros(ways, np.int64), np.zeros(ways, np.bool_)
         self._low: deque[NDArray[np.float64]] = deque(maxlen=_MEMORY)
-        self._limit = np.zeros(ways, np.bool_)  # reached within the present scan
+        self._limit = np.zeros(ways, np.bool_)  # reached within the present block
         self._last: NDArray[np.float64] | None = None
         self._last_ns = np.iinfo(np.int64).min
 
-    def update(self, imu: ImuSamples) -> list[str]:
-        """Take the samples of one scan in; returns the axes that are saturated, one sentence each."""
-        new = imu.time_ns > self._last_ns  # scans share the samples at their border
+    def update(self, imu: ImuSamples) -> list[Limit]:
+        """Take a block of samples in, those of one scan or image; returns the limits that they reach."""
+        new = imu.time_ns > self._last_ns  # blocks share the samples at their border
         if not new.any():
             return []
         along = np.hstack([imu.gyro, imu.accel])[new]
@@ -62,12 +91,7 @@ class Saturation:
         for value, is_cut in zip(values, cuts, strict=True):
             self._follow(value, is_cut)
         clipped = self._limit & (self._peak - np.tile(np.min(self._low, axis=0), 2) > np.tile(_LEAST_SPREAD, 2))
-        told = (
-            f"{_NAMES[way % 6]} saturated at {self._peak[way]:.2f} {'rad/s' if way % 6 < 3 else 'm/s²'}: motion beyond it is not "
-            "measured, covariance widened"
-            for way in np.flatnonzero(clipped).tolist()
-        )
-        return list(dict.fromkeys(told))
+        return [Limit(way, float(self._peak[way])) for way in np.flatnonzero(clipped).tolist()]
 
     def _follow(self, value: NDArray[np.float64], is_cut: NDArray[np.bool_]) -> None:
         """Take one sample in (12,): its axes, and against them; `is_cut` where it changed by more than a step or two."""
@@ -81,3 +105,23 @@ class Saturation:
         self._plateaus += self._cut_off & (self._run == _PLATEAU)
         long_or_again = (self._plateaus >= _ENOUGH) | (self._run >= _LONG)
         self._limit |= self._cut_off & long_or_again & (self._run >= _PLATEAU)
+
+
+def limits_of(imu: ImuSamples) -> list[Limit]:
+    """The limits that samples in order of time reach.
+
+    Example:
+        >>> time_ns = 5_000_000 * np.arange(600)
+        >>> gyro = np.clip(np.sin(3e-9 * time_ns), -0.6, 0.6)[:, None] * [0.0, 0.0, 1.0]
+        >>> limits_of(ImuSamples(time_ns, gyro, np.zeros((600, 3))))[0].text
+        'gyroscope z saturated at 0.60 rad/s'
+    """
+    if not len(imu):
+        return []
+    saturation = Saturation()
+    last: dict[int, Limit] = {}
+    block = (imu.time_ns - imu.time_ns[0]) // _BLOCK_NS
+    for part in np.split(np.arange(len(imu)), np.flatnonzero(np.diff(block)) + 1):
+        last.update({limit.way: limit for limit in saturation.update(imu.where(part))})
+    values = np.hstack([imu.gyro, imu.accel, -imu.gyro, -imu.accel])
+    return [limit for limit in last.values() if values[:, limit.way].max() <= limit.value * (1.0 + _SAME)]

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.sensors.imu import ImuSamples
-from boxplus.systems.lidar_inertial_odometry.watches.saturation import Saturation
+from boxplus.sensors.imu_saturation import Saturation, limits_of
 
 STEP = 0.0081722  # m/s², of the accelerometer that the values below are from
 SCAN = 20  # samples
@@ -22,7 +22,8 @@ def told(accel_z: NDArray[np.float64]) -> list[str]:
     found: list[str] = []
     for k in range(0, len(accel_z) - 1, SCAN):
         part = slice(k, k + SCAN + 1)
-        found += saturation.update(ImuSamples(time_ns[part], np.zeros((len(time_ns[part]), 3)), accel[part]))
+        reached = saturation.update(ImuSamples(time_ns[part], np.zeros((len(time_ns[part]), 3)), accel[part]))
+        found += [limit.text for limit in reached]
     return found
 
 
@@ -45,7 +46,7 @@ def test_a_limit_is_told_when_it_is_reached_again(shift: int) -> None:
     # For three samples, across the border of scans as well.
     z = np.concatenate([np.full(shift, -2.0), vibration([2.0, 3.0, 2.0, 3.0], limit=4.9)])
     assert np.count_nonzero(z == -4.9) == 6
-    assert set(told(z)) == {"accelerometer z saturated at 4.90 m/s²: motion beyond it is not measured, covariance widened"}
+    assert set(told(z)) == {"accelerometer z saturated at 4.90 m/s²"}
 
 
 def test_a_long_plateau_is_told_at_once() -> None:
@@ -92,3 +93,18 @@ def test_a_limit_either_way_is_told_amid_a_motion_that_is_never_slow(rate_hz: in
     assert len(clipped) > 30 and np.isclose(clipped[:, None], when).any(axis=1).mean() > 0.95
     clear = np.flatnonzero(~at_limit.any(axis=1)) * 0.1
     assert not np.isclose(clear[:, None], when).any()
+
+
+@pytest.mark.parametrize("limit", [0.55, 1.3, 4.36])
+@pytest.mark.parametrize("way", [-1.0, 1.0])
+def test_limits_of_a_whole_recording_are_those_that_nothing_exceeds(limit: float, way: float) -> None:
+    random, time_s = np.random.default_rng(3), np.arange(2000) * 0.005
+    swing = np.outer(np.sin(2.0 * time_s), [0.0, 2.0 * limit * way, 0.0]) + 1e-3 * random.normal(size=(2000, 3))
+    swing[:, 1] = np.minimum(way * swing[:, 1], limit) * way
+    imu = ImuSamples((1e9 * time_s).astype(np.int64), swing, 0.02 * random.normal(size=(2000, 3)) + [0.0, 0.0, 9.81])
+    (found,) = limits_of(imu)
+    assert found.text == f"gyroscope y saturated at {limit:.2f} rad/s" and found.of_gyro
+    assert (found.reached(imu) == np.isclose(way * swing[:, 1], limit)).all()
+    beyond = swing.copy()
+    beyond[-1, 1] = 1.5 * limit * way
+    assert not limits_of(ImuSamples(imu.time_ns, beyond, imu.accel))
