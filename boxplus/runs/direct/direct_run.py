@@ -199,10 +199,8 @@ class _Run(CameraRun[Estimate, DirectSummary]):
         """See `RunLoop.summarize`."""
         facts = self.shared_facts(state, error, with_imu=False)
         rolls = [c.name for c in (self._cameras.first, self._cameras.second) if c is not None and c.readout_s]
-        if rolls:
-            facts["warnings"].insert(0, WarningFacts(text=f"{' and '.join(rolls)}: {_ROLLS}", count=1))
-        elif self._odometry.remark:
-            facts["warnings"].insert(0, WarningFacts(text=self._odometry.remark, count=1))
+        told = self._odometry.remarks | ({"shutter": f"{' and '.join(rolls)}: {_ROLLS}"} if rolls else {})
+        facts["warnings"] = [WarningFacts(text=text, count=1) for text in told.values()] + facts["warnings"]
         if self._cameras.kind == "mono":
             facts["warnings"].insert(0, WarningFacts(text=_NO_SCALE, count=1))
         facts["warnings"] += [WarningFacts(text=f"{MAY_BE}: {cause}", count=1) for cause in self._causes]

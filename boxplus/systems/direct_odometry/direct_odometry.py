@@ -110,13 +110,13 @@ class DirectOdometry:
 
     @property
     def contradiction(self) -> str:
-        """Why no pose is to be trusted, whatever the status: grey values contradict intrinsics or depths."""
+        """Why no pose is to be trusted, whatever the status: of the calibration, or of what is in view."""
         return self._watch.contradiction
 
     @property
-    def remark(self) -> str:
-        """What makes poses worse, though not wrong: a rolling shutter; empty where nothing does."""
-        return self._sensor.remark
+    def remarks(self) -> dict[str, str]:
+        """What makes poses worse, though not wrong: of a rolling "shutter", of something in view that is "carried" along."""
+        return self._sensor.remarks
 
     @property
     def start_problem(self) -> str:
@@ -240,6 +240,7 @@ class DirectOdometry:
     def _begin_alone(self, start: TwoViewStart, views: TwoViews, watch: Stopwatch) -> Estimate | None:
         """Two keyframes of one camera alone; None where grey values do not agree with how corners moved."""
         first_ns, time_ns = views.time_ns
+        self._sensor.begin_alone(views)
         depth = depth_of_two(views.first, views.second, self.camera, views.T_21, views.within)
         first = self._keyframe(first_ns, views.first, depth, self._T, 0.0)
         found, wanted = 0 if first is None else len(first.patches), round(_LEAST_FOUND * self.config.patches)
@@ -258,8 +259,7 @@ class DirectOdometry:
         T = se3.compose(self._T, se3.inverse(alignment.T_21))
         depth = depth_from(self.window.keyframes, views.second, self.camera, T, -alignment.brightness[0])
         second = self._keyframe(time_ns, views.second, depth, T, -alignment.brightness[0])
-        self._seen_ns = time_ns
-        self._T, self._covariance, self._reference, self._velocity_s = T, covariance, first, 0.0
+        self._seen_ns, self._T, self._covariance, self._reference, self._velocity_s = time_ns, T, covariance, first, 0.0
         self._log_gain, self._offset = -alignment.brightness[0], alignment.brightness[1]
         if second is not None:
             self.window.add(second, covariance, holds_scale=True)
@@ -339,6 +339,7 @@ class DirectOdometry:
 
     def _keyframe(self, time_ns: int, image: Image, depth: SensedDepth, T: Matrix, log_gain: float) -> WindowKeyframe | None:
         """None where too little has a depth and a gradient."""
+        depth = self._sensor.of_world(image, depth, T, log_gain, self.camera)
         try:
             tracker = Keyframe.prepare(image, depth.z, self.camera, levels=self.config.levels, points=self.config.pixels)
         except InputError:
@@ -368,8 +369,7 @@ class DirectOdometry:
         """No pose: the last one stays; after a while, begin anew from it."""
         self._velocity, self._velocity_s = _STANDSTILL, 0.0
         if self._unseen_s(time_ns) > self.config.lost_s:
-            self.gaps += 1
-            self._reference = None
+            self.gaps, self._reference = self.gaps + 1, None
             if self._start is None:
                 return self._begin(time_ns, image, depth_of, watch)
             self._start = TwoViewStart(self.camera)

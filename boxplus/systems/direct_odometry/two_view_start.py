@@ -45,6 +45,7 @@ _LEAST_AGREE = 0.75  # share of the corners
 _LEAST_AHEAD = 0.95  # of those that agree, in front of both cameras
 _MOST_DIRECTION_DEG = 2.0  # standard deviation of the direction of t
 _DIRECTIONS, _APART_DEG, _LEAST_WORSE = 20, 15.0, 1.5  # that are tried; what is another one; its cost by corner and variance
+_STILL_PX, _SOME_STAND = 0.5, 0.03  # a corner that stands still; their share from which on they may be carried along
 _SAMPLED_PX = 0.5  # that a sampled motion agrees within
 _STEPS, _STEP, _LONGEST = 10, 1e-6, 0.3
 _HUBER, _KNEE, _LEAST_SIGMA = 1.345, 1.0, 0.05  # the latter in pixels
@@ -58,6 +59,7 @@ class TwoViews(NamedTuple):
         time_ns: of both images; first, second: the images.
         T_21: (7,) from the first camera to the second, in units of the median depth in the first.
         within: inverse depths in the first camera that corners have, and some more.
+        is_partly_carried: whether corners stand still that the motion of the others should move: the camera carries them along.
     """
 
     time_ns: tuple[int, int]
@@ -65,6 +67,7 @@ class TwoViews(NamedTuple):
     second: Image
     T_21: Matrix
     within: tuple[float, float]
+    is_partly_carried: bool
 
 
 class TwoViewStart:
@@ -131,6 +134,10 @@ class TwoViewStart:
             self._reference = None
             return None
         m1, m2 = before.rays[i, 0], tracks.rays[j, 0]
+        stands = self._camera.fx * np.linalg.norm(m2 - m1, axis=1) < _STILL_PX
+        still = m1[stands]
+        if (~stands).sum() >= _FEWEST:  # what stands still tells no depth; the camera may carry it along
+            m1, m2 = m1[~stands], m2[~stands]
         f, size = self._camera.fx, sum(image.shape)
         moved = f * float(np.median(np.linalg.norm(m2 - m1, axis=1)))
         left = f * float(np.median(distances(turn_between(m1, m2), m1, m2)))
@@ -146,10 +153,12 @@ class TwoViewStart:
             return None
         R, t, rho = motion
         T_21 = np.concatenate([quaternion.from_matrix(R), t])
+        apart = np.abs(f * _sampson(R, t, still, still)) > _AGREES * _MOST_SIGMA
+        is_partly_carried = bool(apart.sum() > _SOME_STAND * len(common))
         unit = 1.0 / float(np.median(rho))  # of a depth, by |t|
         T_21[4:] /= unit
         low, high = np.quantile(rho * unit, [0.02, 0.98])
-        return TwoViews((first_ns, time_ns), first, image, T_21, (float(low) / _BEYOND, float(high) * _BEYOND))
+        return TwoViews((first_ns, time_ns), first, image, T_21, (float(low) / _BEYOND, float(high) * _BEYOND), is_partly_carried)
 
 
 def _sampson(R: Matrix, t: Matrix, m1: Matrix, m2: Matrix) -> Matrix:

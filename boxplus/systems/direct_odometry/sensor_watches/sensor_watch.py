@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +15,12 @@ from boxplus.sensors.image import Image
 from boxplus.systems.direct_alignment.tracking import Alignment
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair
 from boxplus.systems.direct_odometry.sensor_watches.calibration_watch import CalibrationWatch, Depths
+from boxplus.systems.direct_odometry.sensor_watches.carried_pixels import CarriedPixels
 from boxplus.systems.direct_odometry.sensor_watches.depth_watch import DepthWatch, Surfaces
 from boxplus.systems.direct_odometry.sensor_watches.leftover import Leftover
 from boxplus.systems.direct_odometry.sensor_watches.registration_watch import RegistrationWatch
 from boxplus.systems.direct_odometry.sensor_watches.stereo_watch import StereoWatch
+from boxplus.systems.direct_odometry.two_view_start import TwoViews
 from boxplus.systems.direct_odometry.window_system import WindowKeyframe
 
 Matrix = NDArray[np.float64]
@@ -60,6 +63,7 @@ class SensorWatch:
         self._calibration = CalibrationWatch(depths, stereo)
         self._depths, self._registration = DepthWatch(), RegistrationWatch()
         self._pair = None if stereo is None else StereoWatch(stereo)
+        self._carried = CarriedPixels()
         self._surfaces: dict[int, Surfaces] = {}
         self._velocities: dict[int, Matrix] = {}
 
@@ -67,6 +71,16 @@ class SensorWatch:
         """Both images of a keyframe of a stereo pair, and the depths that were found in them."""
         if self._pair is not None:
             self._pair.add(left, right, depth, camera)
+
+    def begin_alone(self, views: TwoViews) -> None:
+        """The start of one camera alone: where a part of the view is carried along, all that stands still in it is."""
+        if views.is_partly_carried:
+            self._carried.begin(views.first, views.second)
+
+    def of_world(self, image: Image, depth: SensedDepth, T_world_camera: Matrix, log_gain: float, camera: Pinhole) -> SensedDepth:
+        """Depths of a new keyframe without those of pixels that the camera carries along."""
+        carried = self._carried.find(image, T_world_camera, log_gain, camera)
+        return depth if carried is None else replace(depth, z=np.where(carried, np.float32(0.0), depth.z))
 
     def frame(self, keyframe: WindowKeyframe, image: Image, depth: SensedDepth, alignment: Alignment, motion: Motion) -> None:
         """A frame that shall become a keyframe, as it was aligned to another one."""
@@ -98,15 +112,17 @@ class SensorWatch:
             self._surfaces[added.number] = Surfaces.around(added.tracker, _measured(depth), motion.velocity)
 
     @property
-    def remark(self) -> str:
-        """What makes poses worse than they have to be, in a sentence; empty where nothing does."""
-        return self._calibration.remark
+    def remarks(self) -> dict[str, str]:
+        """What makes poses worse than they have to be, a sentence for "shutter" and "carried" each where something does."""
+        told = {"shutter": self._calibration.remark, "carried": self._carried.remark}
+        return {about: remark for about, remark in told.items() if remark}
 
     @property
     def contradiction(self) -> str:
-        """What contradicts the calibration, in a sentence; empty where nothing does."""
+        """What contradicts the calibration, or drew the poses, in a sentence; empty where nothing does."""
         pair = "" if self._pair is None else self._pair.contradiction
-        return pair or self._calibration.contradiction or self._depths.contradiction or self._registration.contradiction
+        calibration = pair or self._calibration.contradiction or self._depths.contradiction
+        return self._carried.contradiction or calibration or self._registration.contradiction
 
 
 def _measured(depth: SensedDepth) -> NDArray[np.float32]:

@@ -45,7 +45,7 @@ def test_frames_are_asked_at_any_rate(step_s: float) -> None:
     assert "contradict the focal length: they ask for -" in run(0, step_s, camera=LONG).contradiction
     assert "% of the median depth off" in run(0, step_s, too_far=0.3).contradiction
     sound = run(0, step_s)
-    assert sound.contradiction == "" and sound.remark == ""
+    assert sound.contradiction == "" and sound.remarks == {}
 
 
 def begin_again_and_again(turn: float) -> tuple[DirectOdometry, list[Estimate]]:
