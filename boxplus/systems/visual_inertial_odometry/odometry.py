@@ -362,7 +362,7 @@ class VisualInertialOdometry:
         lines = tracks.lines
         covariance = self.window.covariance
         self._watch.add(pose, state, covariance, self.window.last_step)
-        if is_keyframe:
+        if is_keyframe and not rests:  # the same view again has the same errors
             self._focal_watch.add(tracks)
         sigma, apart = position_sigma(covariance), self._focal_watch.contradiction or self._watch.contradiction
         status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, sigma, apart, limits)

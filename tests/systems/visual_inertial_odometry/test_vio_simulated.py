@@ -164,6 +164,14 @@ def test_a_silent_imu_is_bridged_by_the_images_taken_meanwhile(cameras: int) -> 
         assert error @ np.linalg.solve(covariance, error) < chi2.ppf(0.999, 4)
 
 
+def test_the_same_view_again_tells_nothing_new_of_focal_lengths() -> None:
+    """A minute of rest, whose corners err alike in every image, passed for a focal length that is 1 % off."""
+    resting, _ = run(Flight(3, 1.2), rig(), CONFIG)
+    moving, _ = run(Flight(3, 3.0), rig(), CONFIG)
+    assert resting.start is not None and resting.start.kind == "at rest"
+    assert np.isinf(resting._focal_watch.sigma).all() and np.isfinite(moving._focal_watch.sigma).all()
+
+
 @pytest.mark.parametrize("limit", [0.55, 0.7, np.inf])
 def test_frames_whose_samples_sit_at_the_limit_of_the_gyroscope_are_weak_and_say_so(limit: float) -> None:
     flight = Flight(705, 5.0)

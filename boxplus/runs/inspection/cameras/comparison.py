@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.cameras import CameraModel
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence
 from boxplus.runs.inspection.cameras.carried import Followed, check_carried
@@ -24,7 +25,8 @@ from boxplus.sensors.camera_image import CameraImage
 from boxplus.sensors.imu import ImuSamples
 
 _STEREO_PAIRS = 12
-_MOST_TURNS = 240
+_MOST_TURNS, _MOST_STILL = 240, 2000  # pairs of images in which the camera moves, and rests
+_STILL_PX = 0.5  # median of the corners of images that stand: between them any rotation fits, beside some translation
 _APART = 3
 _SHOWN = 16  # grey values between the darkest and the brightest pixel of an image that shows something
 
@@ -43,6 +45,7 @@ class Comparison:
     def __init__(self, pictures: Sequence[CameraStream], images: int) -> None:
         self._pictures = list(pictures)
         self._every = max(1, images // _STEREO_PAIRS)
+        self._still = 0  # pairs of images of the first camera between which it rests
         self._seconds = 0  # images of the second camera so far
         self._same = 0  # of the pairs that were compared
         self._last: tuple[int, NDArray[np.uint8]] | None = None
@@ -73,14 +76,22 @@ class Comparison:
         # Over a few images the turn is larger and its error the same.
         if len(turns.images) == _APART:
             before_ns, before = turns.images[0]
-            turns.tried += 1
             corners = follow(before, grey)
-            self._followed.append(Followed(before_ns, time_ns, *corners))
-            turned = rotation_between(model, *corners)
-            turns.followed.append(turned.followed if isinstance(turned, Turned) else turned)
-            if isinstance(turned, Turned):
-                turns.add(before_ns, time_ns, turned.R_2_1, turned.before, turned.after)
+            if self._still < _MOST_STILL and _stand(*corners):
+                self._still += 1
+                turns.followed.append(len(corners[0]))
+            else:
+                self._turned(Followed(before_ns, time_ns, *corners), model)
         turns.images.append((time_ns, grey))
+
+    def _turned(self, pair: Followed, model: CameraModel) -> None:
+        """Note how the first camera turned between two images."""
+        self._followed.append(pair)
+        self.turns.tried += 1
+        turned = rotation_between(model, pair.before, pair.after)
+        self.turns.followed.append(turned.followed if isinstance(turned, Turned) else turned)
+        if isinstance(turned, Turned):
+            self.turns.add(pair.begin_ns, pair.end_ns, turned.R_2_1, turned.before, turned.after)
 
     def of_cameras(self) -> list[Evidence]:
         """Whether the stereo calibration fits, and its lengths are metres; nothing of one camera alone."""
@@ -106,3 +117,8 @@ class Comparison:
             known, *apart = (known_turns(camera, turns, imu, aligned, side) for side in (0.0, -1.0, 1.0))
             found += [check_readout(camera, known, apart), check_focal_length(camera, known)]
         return found
+
+
+def _stand(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
+    """Whether images with these corners (N, 2) are of a camera that rests."""
+    return len(before) > 0 and float(np.median(np.linalg.norm(after - before, axis=1))) < _STILL_PX

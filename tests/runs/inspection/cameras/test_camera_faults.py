@@ -357,3 +357,29 @@ def test_a_simulated_recording_says_what_is_wrong_with_it(filmed: CameraSimulati
         assert not wrong
     else:
         assert key in wrong and fault.named_in(" ".join(evidence.text for evidence in wrong.values()))
+
+
+@needs_cv2
+def test_a_rest_before_the_motion_leaves_camera_and_gyroscope_alike() -> None:
+    """Between images that stand any rotation fits: half a minute of rest passed for a gyroscope of another platform."""
+    simulation = simulate_cameras("room_moving", 5, duration_s=6.0, rig=make_rig("mono", None, 0.4, 20.0))
+    random, period_ns, rests = np.random.default_rng(5), 50_000_000, 300
+    images = [simulation.image(0, k) for k in range(simulation.image_count)]
+    imu = simulation.imu.samples(simulation.start_ns, simulation.end_ns, 0)
+    first = images[0]
+    still = [
+        dataclasses.replace(
+            first,
+            time_ns=first.time_ns - (rests - k) * period_ns,
+            pixels=np.clip(first.pixels + random.normal(0.0, 1.0, first.pixels.shape), 0, 255).astype(np.uint8),
+        )
+        for k in range(rests)
+    ]
+    before_ns = np.arange(still[0].time_ns - 500_000_000, imu.time_ns[0], 5_000_000)
+    noise = random.normal(0.0, 2e-3, (len(before_ns), 3))
+    rest = ImuSamples(before_ns, noise, np.tile([0.0, 0.0, 9.81], (len(before_ns), 1)))
+    comparison = Comparison(streams(simulation.scenario.rig), rests + len(images))
+    for image in [*still, *images]:
+        comparison.note(image, image.grey().astype(np.uint8))
+    found = {finding.key: finding for finding in comparison.with_imu(ImuSamples.joined([rest, imu]))}
+    assert found["R_imu_cam0"].verdict == "ok" and "deg apart" in found["R_imu_cam0"].value
