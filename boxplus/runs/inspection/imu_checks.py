@@ -70,8 +70,8 @@ def check_rest(imu: ImuSamples, stretch: slice, *, quiet: bool, rest: Rest | Non
     accel_std = np.mean([imu.accel[window].std(axis=0) for window in windows], axis=0)
     bias = imu.gyro[stretch].mean(axis=0)
     norm = float(np.linalg.norm(imu.accel[stretch].mean(axis=0)))
-    off = abs(norm / STANDARD_GRAVITY - 1.0) > _GRAVITY_OFF
-    advice = ": more than 3 % off, so the accelerometer's scale or unit is wrong, or its bias is large" if off else ""
+    advice = doubt_of_gravity(norm)
+    off = bool(advice)
     shaken = "" if quiet else ", shaken"
     return [
         Evidence("standstill", f"{span:.1f} s", "ok", f"{where}{shaken}, at {rate:.0f} Hz; {seen}"),
@@ -94,6 +94,18 @@ def check_rest(imu: ImuSamples, stretch: slice, *, quiet: bool, rest: Rest | Non
         ),
         _gravity(imu.accel[stretch].mean(axis=0), "the mean at rest"),
     ]
+
+
+def doubt_of_gravity(norm: float) -> str:
+    """What the mean |acceleration| at rest [m/s²] says against an accelerometer; empty where it may be in order.
+
+    Example:
+        >>> doubt_of_gravity(9.7), doubt_of_gravity(10.3)
+        ('', ": more than 3 % off, so the accelerometer's scale or unit is wrong, or its bias is large")
+    """
+    if abs(norm / STANDARD_GRAVITY - 1.0) <= _GRAVITY_OFF:
+        return ""
+    return ": more than 3 % off, so the accelerometer's scale or unit is wrong, or its bias is large"
 
 
 def first_second(imu: ImuSamples) -> slice:

@@ -20,6 +20,7 @@ from boxplus.runs.cameras.folder import VioFolder, claim_camera_folder
 from boxplus.runs.cameras.image_gaps import ImageGaps
 from boxplus.runs.cameras.landmark_file import LandmarkFile, LandmarksById, write_lines
 from boxplus.runs.cameras.turning import Turning
+from boxplus.runs.inspection.imu_checks import doubt_of_gravity
 from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_loop import Progress
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
@@ -32,10 +33,11 @@ from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 from boxplus.systems.visual_inertial_odometry.odometry import REPEATED, VisualInertialOdometry
 from boxplus.systems.visual_inertial_odometry.start.start import Start
 
+_AT_REST = "mean specific force [m/s²]"
 _TOLD = {
     "duration [s]": "over {:.2f} s",
     "image motion [px]": "images move by {:.2f} px",
-    "mean specific force [m/s²]": "specific force {:.2f} m/s²",
+    _AT_REST: "specific force {:.2f} m/s²",
     "acceleration, variation [m/s²]": "acceleration varies by {:.2f} m/s²",
     "sightings, deviation [px]": "corners deviate by {:.2f} px",
     "gravity, deviation [deg]": "gravity is known to {:.2f} deg",
@@ -267,7 +269,8 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
                 "part of the platform in view, or the middle of a circle that it moved on; they were left out"
             )
             shared["warnings"].append(WarningFacts(text=text, count=carried))
-        shared["warnings"] += [WarningFacts(text=doubt, count=1) for doubt in self._doubts]
+        doubts = self._doubts if start is None else [*gravity_doubts(start, len(self._rig.cameras)), *self._doubts]
+        shared["warnings"] += [WarningFacts(text=doubt, count=1) for doubt in doubts]
         shared["warnings"] += [WarningFacts(text=f"{MAY_BE}: {cause}", count=1) for cause in self._causes]
         return VioSummary(
             **shared,
@@ -328,6 +331,13 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
                 )
             )
         return facts
+
+
+def gravity_doubts(start: Start, cameras: int) -> list[str]:
+    """What a start at rest says against the accelerometer, a sentence: the lengths of one camera are all from it."""
+    doubt = doubt_of_gravity(start.facts[_AT_REST]) if start.kind == "at rest" else ""
+    lengths = "; the lengths of one camera are off by as much where it is the scale" if cameras == 1 else ""
+    return [f"at rest the accelerometer measured {start.facts[_AT_REST]:.2f} m/s² of 9.81{doubt}{lengths}"] if doubt else []
 
 
 def _length_facts(longer: float, sigma: float) -> LengthFacts:
