@@ -119,7 +119,8 @@ class RunTerminal(Terminal):
         for text in warnings:
             self.warn(text)
         if summary.not_shown is not None:
-            self.say(f"not shown by the motion of LiDAR and IMU, which would not have noticed an error of it: {summary.not_shown}")
+            blind = "not shown by the motion of LiDAR and IMU, which would not have noticed an error of it"
+            self.say(f"{blind}: {summary.not_shown}")
         self.print_files(folder, files)
 
     def print_table(self, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

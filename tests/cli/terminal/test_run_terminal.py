@@ -57,7 +57,8 @@ def test_the_first_line_says_whether_a_result_is_to_be_trusted(doubt: str | None
 
 def test_what_the_motion_has_not_shown_is_said_after_the_warnings() -> None:
     shown, alarms = _results_shown(not_shown="lengths")
-    assert "not shown by the motion of LiDAR and IMU, which would not have noticed an error of it: lengths" in shown and "not shown" not in alarms
+    said = "not shown by the motion of LiDAR and IMU, which would not have noticed an error of it: lengths"
+    assert said in shown and "not shown" not in alarms
 
 
 def _results_shown(*, doubt: str | None = None, not_shown: str | None = None) -> tuple[str, str]:
