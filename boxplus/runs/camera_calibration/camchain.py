@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from boxplus.cameras import CameraModel, DoubleSphere, Equidistant
 from boxplus.manifolds.nearest_rotation import nearest_rotation
+from boxplus.recordings.bags.transforms import apart
 from boxplus.recordings.cameras.calibration import StatedRig, inverse
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.runs.camera_calibration.summary import CalibrationSummary, mountings
@@ -118,12 +119,11 @@ def compare(found: CameraCalibration, other: StatedRig, name: str) -> list[str]:
     for camera in range(1, min(len(T), len(stated))):
         mine, theirs = T[camera], stated[camera].T_body_camera
         if mine is not None and theirs is not None and first is not None:
-            step = inverse(inverse(first) @ theirs) @ mine
-            angle = np.degrees(np.arccos(np.clip((np.trace(step[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
-            baselines = [float(np.linalg.norm(pose[:3, 3])) for pose in (mine, inverse(first) @ theirs)]
-            apart_m = float(np.linalg.norm(step[:3, 3]))
+            stated_pose = inverse(first) @ theirs
+            angle, apart_m = apart(stated_pose, mine)
+            baselines = [float(np.linalg.norm(pose[:3, 3])) for pose in (mine, stated_pose)]
             lines.append(
-                f"cam{camera} to cam0: {angle:.3f} deg and {apart_m * 1e3:.2f} mm from {name}; baselines "
+                f"cam{camera} to cam0: {np.degrees(angle):.3f} deg and {apart_m * 1e3:.2f} mm from {name}; baselines "
                 f"{baselines[0] * 1e3:.2f} and {baselines[1] * 1e3:.2f} mm"
             )
     return lines

@@ -168,7 +168,7 @@ def _guessed(
         std_deg, std_m: (3,) each, of rotation (ascending) and translation.
         open_axes: whether the motion has not turned about enough axes to show the rotation.
     """
-    angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
+    angle = np.degrees(np.linalg.norm(so3.log(T[:3, :3])))
     p, s_p = ", ".join(f"{value:.3f}" for value in T[:3, 3]), ", ".join(f"{value:.2f}" for value in std_m)
     s_R = ", ".join(f"{value:.1f}" for value in std_deg)
     text = f"{how}: {angle:.1f} deg from identity (std {s_R} deg about its principal axes), translation ({p}) m (std {s_p} m)"
