@@ -59,6 +59,7 @@ class ShownByMotion:
     """Follows the comparisons of one run."""
 
     def __init__(self) -> None:
+        self._has_turned = False
         self._gyroscope: tuple[float, float, float] | None = None
         self._clocks: tuple[float, float, float] | None = None
         self._mounting: NDArray[np.float64] = np.zeros((3, 3))
@@ -69,6 +70,7 @@ class ShownByMotion:
         rotation = agreement.rotation
         if rotation is None or not judges_rotation(agreement):
             return
+        self._has_turned = True
         if judges_scale(rotation):
             self._gyroscope = _surer(self._gyroscope, (rotation.scale, rotation.scale_std, least_scale(rotation)))
         if judges("time_offset", agreement):
@@ -88,7 +90,8 @@ class ShownByMotion:
 
     def _of_gyroscope(self) -> Shown:
         if self._gyroscope is None:
-            return Shown("gyroscope", False, None, None, None, "the gyroscope's unit, sign and scale: it hardly turned")
+            what = "the gyroscope's scale" if self._has_turned else "the gyroscope's unit, sign and scale"
+            return Shown("gyroscope", False, None, None, None, what)
         value, std, least = self._gyroscope
         return Shown(
             "gyroscope", True, value, std, least, f"the gyroscope turns {value:.3f} ± {std:.3f} times as far as the LiDAR"
