@@ -56,6 +56,13 @@ def test_what_is_shown_is_named_where_it_is_wrong(walk: tuple[Simulation, Agreem
         assert ("gyro_scale" in [f.cause for f in contradictions(replace(agreement, rotation=fast), T)]) == named
 
 
+def test_turns_that_are_explained_coarsely_show_unit_and_sign_alone(walk: tuple[Simulation, Agreement]) -> None:
+    rotation = walk[1].rotation
+    assert rotation is not None
+    gyroscope = _parts(replace(walk[1], rotation=replace(rotation, explained=0.9)))["gyroscope"]
+    assert not gyroscope.shown and gyroscope.text == "the gyroscope's scale"
+
+
 def test_at_a_steady_speed_nothing_is_shown() -> None:
     motion = constant_velocity(4.0, (-6.0, 0.0, 1.5), (2.0, 0.0, 0.0), level(0.2))
     T = mounting(2.0, -3.0, 25.0, (0.1, 0.0, 0.2))
