@@ -26,8 +26,8 @@ from boxplus.optimization.solution import Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.terms.variables import Variables
 from boxplus.systems.pose_graph.certificate import Certificate, certify
-from boxplus.systems.pose_graph.contradictions import contradictions
-from boxplus.systems.pose_graph.doubts import (
+from boxplus.systems.pose_graph.doubts.contradictions import contradictions
+from boxplus.systems.pose_graph.doubts.fit import (
     Fit,
     disagree,
     drifted_doubt,
@@ -42,7 +42,10 @@ from boxplus.systems.pose_graph.doubts import (
     undetermined_notes,
     without_information,
 )
-from boxplus.systems.pose_graph.information_readings import information_doubt, slack_part_notes
+from boxplus.systems.pose_graph.doubts.information_readings import information_doubt, slack_part_notes
+from boxplus.systems.pose_graph.doubts.readings import misreading
+from boxplus.systems.pose_graph.doubts.reliability import Reliability, suspicions
+from boxplus.systems.pose_graph.doubts.witnesses import held_against_each_other, lone_joints
 from boxplus.systems.pose_graph.loops import LoopVerdict, judge_loops
 from boxplus.systems.pose_graph.problem import (
     Objective,
@@ -52,11 +55,8 @@ from boxplus.systems.pose_graph.problem import (
     turns,
     with_edges,
 )
-from boxplus.systems.pose_graph.readings import misreading
-from boxplus.systems.pose_graph.reliability import Reliability, suspicions
 from boxplus.systems.pose_graph.start import held_poses
 from boxplus.systems.pose_graph.starts import Start, Starts, Wanted
-from boxplus.systems.pose_graph.witnesses import held_against_each_other, lone_joints
 
 # Almost Gauss-Newton: long chains are so badly conditioned that more damping than this costs iterations. Less would soon be below
 # what a pivot is told from rounding by, and have to grow again where edges leave something free.

@@ -11,8 +11,8 @@ import pytest
 from boxplus import InputError, PoseGraphConfig, optimize_pose_graph
 from boxplus.manifolds import se2, se3
 from boxplus.simulation.pose_graphs import simulate_pose_graph
+from boxplus.systems.pose_graph.doubts.readings import misreading
 from boxplus.systems.pose_graph.problem import consecutive_edges
-from boxplus.systems.pose_graph.readings import misreading
 
 STARTS = ("auto", "file", "chordal", "spanning_tree")
 

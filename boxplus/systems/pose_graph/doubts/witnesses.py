@@ -19,7 +19,8 @@ from boxplus.optimization.losses import Loss
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.sparse.graphs.components import connected_components
 from boxplus.sparse.graphs.cut_edges import cut_edges
-from boxplus.systems.pose_graph.doubts import Fit, edge_names, misfit, standing_out
+from boxplus.systems.pose_graph.doubts.fit import Fit, edge_names, misfit, standing_out
+from boxplus.systems.pose_graph.doubts.reliability import BENT, Reliability, Suspicion, suspicions
 from boxplus.systems.pose_graph.problem import (
     consecutive_edges,
     pose_graph_problem,
@@ -27,7 +28,6 @@ from boxplus.systems.pose_graph.problem import (
     squared_errors,
     with_edges,
 )
-from boxplus.systems.pose_graph.reliability import BENT, Reliability, Suspicion, suspicions
 from boxplus.systems.pose_graph.start import components, held_poses
 
 _TOLD = 5  # lone joints, before the rest is counted

@@ -22,9 +22,9 @@ from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.solution import Iteration, Solution
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.optimization.terms.variables import Variables
+from boxplus.systems.pose_graph.doubts.reliability import Reliability
 from boxplus.systems.pose_graph.named import named
 from boxplus.systems.pose_graph.problem import edge_parts, pose_graph_problem, residual_of, squared_errors
-from boxplus.systems.pose_graph.reliability import Reliability
 
 _SMALL, _LEAST = 0.7, 30  # χ² of what is promised, below which it is asked, and degrees of freedom for it to mean much
 _AS_PROMISED = (0.6, 1.6)  # χ² of rotations and of translations, where a reading is right

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from boxplus._chi_square import chi_square_quantile
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.optimization.solver_options import SolverOptions
+from boxplus.systems.pose_graph.doubts.reliability import Reliability
 from boxplus.systems.pose_graph.loops import LoopVerdict
 from boxplus.systems.pose_graph.problem import odometry_order, pose_graph_problem, residual_of, with_edges
-from boxplus.systems.pose_graph.reliability import Reliability
 
 _MANY, _NEARLY_ALL = 0.5, 0.8  # share of the loop closures
 _FEW = 5  # stretches that loop closures were kept between; fewer agree as they happen to

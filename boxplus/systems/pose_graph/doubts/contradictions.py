@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from boxplus._chi_square import chi_square_quantile, chi_square_sf
 from boxplus.formats.graphs.pose_graph import PoseGraph
-from boxplus.systems.pose_graph.arms import find_arms
 from boxplus.systems.pose_graph.bridges import Bridge
 from boxplus.systems.pose_graph.consensus import Crossings
-from boxplus.systems.pose_graph.doubts import pose_names
+from boxplus.systems.pose_graph.doubts.arms import find_arms
+from boxplus.systems.pose_graph.doubts.fit import pose_names
+from boxplus.systems.pose_graph.doubts.refusals import refusals_doubt
 from boxplus.systems.pose_graph.loops import LoopVerdict
 from boxplus.systems.pose_graph.problem import odometry_order, with_edges
-from boxplus.systems.pose_graph.refusals import refusals_doubt
 from boxplus.systems.pose_graph.start import components
 
 _STRANGE = 1e-6  # chance of noise to bend sound odometry anywhere as far as that

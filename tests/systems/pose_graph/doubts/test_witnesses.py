@@ -10,8 +10,8 @@ import pytest
 from boxplus import PoseGraphConfig, losses, optimize_pose_graph
 from boxplus.formats.graphs.pose_graph import PoseGraph
 from boxplus.simulation.pose_graphs import simulate_pose_graph
+from boxplus.systems.pose_graph.doubts.witnesses import lone_joints
 from boxplus.systems.pose_graph.problem import consecutive_edges, with_edges
-from boxplus.systems.pose_graph.witnesses import lone_joints
 
 CHORDAL = PoseGraphConfig(objective="chordal")
 FORGETTING = (losses.GemanMcClure(3.0), losses.Tukey(4.685), losses.Cauchy(2.0))

@@ -16,9 +16,9 @@ from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.simulation.pose_graphs import simulate_pose_graph
 from boxplus.sparse.graphs.components import connected_components
-from boxplus.systems.pose_graph.arms import bridges_of
+from boxplus.systems.pose_graph.doubts.arms import bridges_of
+from boxplus.systems.pose_graph.doubts.reliability import Reliability
 from boxplus.systems.pose_graph.problem import consecutive_edges, with_edges
-from boxplus.systems.pose_graph.reliability import Reliability
 from tests.systems.pose_graph.laps import laps
 
 GNC = PoseGraphConfig(robust="gnc")

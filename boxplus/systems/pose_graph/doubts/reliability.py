@@ -25,8 +25,8 @@ from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.terms.variables import Variables
-from boxplus.systems.pose_graph.contradiction import Contradiction
-from boxplus.systems.pose_graph.doubts import Fit, edge_names
+from boxplus.systems.pose_graph.doubts.contradiction import Contradiction
+from boxplus.systems.pose_graph.doubts.fit import Fit, edge_names
 from boxplus.systems.pose_graph.problem import odometry_order, residual_of
 
 Floats = NDArray[np.float64]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from boxplus.systems.pose_graph.contradiction import Contradiction
+from boxplus.systems.pose_graph.doubts.contradiction import Contradiction
 
 
 def by_directions(errors, predicted, least):
