@@ -146,7 +146,7 @@ def _sensors(data: RunData) -> str:
         "LiDAR and IMU are compared every few seconds, and what contradicts is named. What the motion has not shown could be "
         "wrong without a word: on a straight way at a steady speed a factor on all points, say."
     )
-    rows = [("shown" if part.shown else "not shown", part.text) for part in data.summary.sensors]
+    rows = [("shown" if part.shown else "would not have been shown", part.text) for part in data.summary.sensors]
     table = html_table(rows, ("by the motion", "what"))
     return f"<section><h2>What the motion has shown</h2><p>{escape(text)}</p>{table}</section>"
 

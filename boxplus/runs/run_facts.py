@@ -105,7 +105,7 @@ class RunFacts(Part, ABC):
 
     @property
     def not_shown(self) -> str | None:
-        """What of the sensors the motion has not shown, so that an error would have gone unnoticed; None if nothing."""
+        """Which errors of the sensors the motion would not have shown; None if it would have shown all."""
         return None
 
     @property

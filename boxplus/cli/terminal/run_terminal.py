@@ -119,8 +119,7 @@ class RunTerminal(Terminal):
         for text in warnings:
             self.warn(text)
         if summary.not_shown is not None:
-            blind = "not shown by the motion of LiDAR and IMU, which would not have noticed an error of it"
-            self.say(f"{blind}: {summary.not_shown}")
+            self.say(f"LiDAR and IMU would not have shown, as they moved: {summary.not_shown}")
         self.print_files(folder, files)
 
     def print_table(self, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

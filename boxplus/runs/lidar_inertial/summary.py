@@ -44,8 +44,8 @@ class ShownFacts(Part):
     """What the motion has shown of one part of the sensors; see `boxplus.systems.lidar_inertial_agreement.shown.Shown`."""
 
     part: Literal["gyroscope", "clocks", "mounting", "lengths"]
-    shown: bool = Field(description="whether an error of it would have been named")
-    value: float | None = Field(description="as the sensors show it: a factor (gyroscope, lengths) or seconds (clocks)")
+    shown: bool = Field(description="whether an error of it would have been named, or was")
+    value: float | None = Field(description="a factor (gyroscope, lengths), or what the LiDAR's times lack [s]")
     std: float | None = Field(description="standard deviation of it; of the mounting's rotation about its worst axis [deg]")
     unnoticed: float | None = Field(description="how far it may be off without being named; null: any error may")
     text: str
@@ -104,7 +104,9 @@ class RunSummary(RunFacts):
         None,
         description="that the run itself does not know where it ends, to a fifth of its way: the `contradiction` if no other",
     )
-    sensors: list[ShownFacts] = Field(default=[], description="what the motion has shown of LiDAR and IMU; empty without an IMU")
+    sensors: list[ShownFacts] = Field(
+        default=[], description="what the motion has shown of LiDAR and IMU since the last start; empty without an IMU"
+    )
     lidars: list[LidarFacts] = Field(default=[], description="of several that were merged; empty for one alone")
     scans: int = 0
     scans_read: int = 0

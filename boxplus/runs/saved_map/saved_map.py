@@ -242,6 +242,6 @@ def _refuse_another_unit(path: Path, points: NDArray[np.float32]) -> None:
     extent = " x ".join(f"{width:.0f}" for width in high - low)
     raise InputError(
         f"a cloud in metres, with surfaces of many points in a cube of {_ALONE_M:g} m",
-        f"{100.0 * alone:.0f} % as many such cubes as points, in a cloud of {extent} m ({path})",
-        "multiply it by 0.001 where it is in millimetres, by 0.01 in centimetres; else give one with more points",
+        f"{100.0 * alone:.0f} % of the points alone in theirs, in a cloud of {extent} m ({path})",
+        "multiply it by 0.001 where it is in millimetres, by 0.01 in centimetres; thin it less where it is in metres",
     )

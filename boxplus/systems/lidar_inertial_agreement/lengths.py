@@ -39,9 +39,10 @@ def lengths_of_many(slopes: Sequence[tuple[float, float]]) -> Finding | None:
 
 
 def least_factor(slopes: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
-    """The slope of these stretches, its standard deviation, and how far it is off at least where it is named."""
-    slope, std = _mean(slopes) if len(slopes) >= FEWEST_SLOPES else slopes[0]
-    return slope, std, _least(std, _DEVIATIONS_OF_MANY if len(slopes) >= FEWEST_SLOPES else _DEVIATIONS)
+    """The slope of these stretches, its standard deviation, and how far it is off at least where it is named; inf where never."""
+    together = len(slopes) >= FEWEST_SLOPES
+    slope, std = _mean(slopes) if together else slopes[0]
+    return slope, std, _least(std, _DEVIATIONS_OF_MANY if together else _DEVIATIONS) if std <= SLOPE_KNOWN else np.inf
 
 
 def lengths_known(slopes: Sequence[tuple[float, float]]) -> bool:

@@ -35,6 +35,22 @@ def turn_from(fit: RotationFit, R_imu_lidar: NDArray[np.float64]) -> Turn:
     return so3.log(fit.R_imu_lidar @ R_imu_lidar.T), (axes * known) @ axes.T
 
 
+def combined(turns: Sequence[Turn]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """The mean turn (3,) of stretches, its standard deviations (3,) [rad], ascending, and their axes, one a column (3, 3)."""
+    information = sum((known for _, known in turns), 1e-6 * np.eye(3))
+    theta = np.linalg.solve(information, sum((known @ turn for turn, known in turns), np.zeros(3)))
+    # Stretches that differ by more than they say know less than they say.
+    scatter = sum(float((turn - theta) @ known @ (turn - theta)) for turn, known in turns) / (3.0 * max(len(turns) - 1, 1))
+    variance, axes = np.linalg.eigh(np.linalg.inv(information))
+    std: NDArray[np.float64] = np.sqrt(variance * max(scatter, 1.0))
+    return np.asarray(theta, np.float64), std, axes
+
+
+def least_turn(std: NDArray[np.float64]) -> float:
+    """The smallest turn from a given mounting that is named, by the standard deviations of the axes that are known [rad]."""
+    return float(LAG_RAD + _DEVIATIONS * np.linalg.norm(std))
+
+
 def mounting_of_many(turns: Sequence[Turn]) -> Finding | None:
     """Whether stretches that do not overlap show another mounting than the one that was given.
 
@@ -43,17 +59,12 @@ def mounting_of_many(turns: Sequence[Turn]) -> Finding | None:
     """
     if len(turns) < _FEWEST_TURNS:
         return None
-    information = sum((known for _, known in turns), 1e-6 * np.eye(3))
-    theta = np.linalg.solve(information, sum((known @ turn for turn, known in turns), np.zeros(3)))
-    # Stretches that differ by more than they say know less than they say.
-    scatter = sum(float((turn - theta) @ known @ (turn - theta)) for turn, known in turns) / (3.0 * (len(turns) - 1))
-    variance, axes = np.linalg.eigh(np.linalg.inv(information))
-    std = np.sqrt(variance * max(scatter, 1.0))
+    theta, std, axes = combined(turns)
     seen = std < ROTATION_KNOWN_RAD
     off = (axes * seen) @ axes.T @ theta
     angle, sigma = float(np.linalg.norm(off)), float(np.linalg.norm(std[seen]))
     alike = np.mean([float(off @ known @ turn) > 0.5 * float(off @ known @ off) for turn, known in turns])
-    if angle < LAG_RAD + _DEVIATIONS * sigma or alike < _ALIKE:
+    if angle < least_turn(std[seen]) or alike < _ALIKE:
         return None
     return Finding(
         "extrinsic",

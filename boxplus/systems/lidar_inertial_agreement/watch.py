@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +34,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thi
 from boxplus.systems.lidar_inertial_agreement.mounting_in_use import mounting_in_use, shows_about
 from boxplus.systems.lidar_inertial_agreement.mountings import Turn, mounting_of_many, turn_from
 from boxplus.systems.lidar_inertial_agreement.shown import Shown, ShownByMotion
-
-Said = TypeVar("Said")
+from boxplus.systems.lidar_inertial_agreement.stretches import Stretches
 
 _DRIFT_S, _DRIFT_DEVIATIONS = 0.012, 4.0
 _WINDOW_S = 4.0
@@ -48,7 +46,6 @@ _DECIDED_EVERY_S = (8.0, 8.0, 16.0, 20.0)
 _SUSPECTED_EVERY_S = 2.0
 _MOST_SLOPES = 6  # that are asked for sooner than what is decided
 _OF_ACCELERATIONS = ("length_scale", "force_sign")  # causes that leave rotations as they are
-_OVERLAP_NS = 500_000_000  # of stretches that count as two
 
 
 class Watch:
@@ -85,14 +82,14 @@ class Watch:
         self._T_last: NDArray[np.float64] | None = None
         self._T_compared: NDArray[np.float64] = np.eye(4)
         self._first_with_clocks: Agreement | None = None
-        self._slopes: _Stretches[tuple[float, float]] = _Stretches()
-        self._turns: _Stretches[Turn] = _Stretches()
-        self._shown = ShownByMotion()
+        self._slopes: Stretches[tuple[float, float]] = Stretches()
+        self._turns: Stretches[Turn] = Stretches()
+        self._shown = ShownByMotion(None if T_declared is None else T_declared[:3, :3])
 
     @property
     def shown(self) -> tuple[Shown, ...]:
         """What the motion has shown of the sensors so far, part by part."""
-        return self._shown.parts(self._slopes.said)
+        return self._shown.parts(self._slopes.said, self.contradiction)
 
     def add(
         self,
@@ -233,20 +230,6 @@ class Watch:
             return findings
         lengths = lengths_of_many(self._slopes.said)
         return [] if lengths is None else [lengths]
-
-
-class _Stretches(Generic[Said]):
-    """What stretches that do not overlap said, each for itself."""
-
-    def __init__(self) -> None:
-        self.said: list[Said] = []
-        self._until_ns = 0
-
-    def add(self, agreement: Agreement, said: Said) -> None:
-        """One more, unless it overlaps the last one."""
-        if int(agreement.path.time_ns[0]) > self._until_ns - _OVERLAP_NS:
-            self.said.append(said)
-            self._until_ns = int(agreement.path.time_ns[-1])
 
 
 def _clears(finding: Finding, agreement: Agreement) -> bool:

@@ -2,8 +2,9 @@
 
 The larger set is what two sessions are joined by; the smaller one is left out as what outliers are, and all that the session saw
 from there on lies at the wrong place in the joint map, over what the other one saw there. Encounters that are false for another
-reason, as two places look alike, are single, or lie among true ones along the way. So those are asked for that agree with each
-other, come from two local maps of a session at least, and come all before or all after those that it is joined by.
+reason, as two places look alike, are mostly single, or lie among true ones along the way. So those are asked for that agree with
+each other, come from two local maps of a session at least, and come all before or all after those that it is joined by. Where a
+way ends in a place like another one that may be so as well, and both are said.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ def slip_of(kept: Sequence[Loop], others: Sequence[Loop], names: tuple[str, str]
         how = f"{metres:.1f} m" + (f" and {np.rad2deg(turn):.0f}°" if turn >= _LEAST_RAD else "")
         return (
             f"{names[1]} and {names[0]} lie over each other along a part of the way only: {counted(len(others), 'encounter')} of "
-            f"local maps {min(theirs)} to {max(theirs)} of {name} agree with each other on {how} from where they are by those of "
-            f"local maps {min(own)} to {max(own)}: the odometry of one of the two slipped between"
+            f"local maps {min(theirs)} to {max(theirs)} of {name} agree with each other, and lie {how} from where those of "
+            f"local maps {min(own)} to {max(own)} put them: the odometry of one of the two slipped "
+            "between, or two places look alike"
         )
     return None
