@@ -143,7 +143,11 @@ def _compare(
     elif _turns_off(found.rotation):
         surer = surer_path(path, scans, config, guesses) or path
     if surer is None:
-        return replace(found, rotation=None, translation=None, astray=astray)
+        # Planes lean as they do however far the LiDAR went past them.
+        planes = None
+        if T_declared is not None and explained is not None and explained.turns_alike:
+            planes = plane_tilt(path, scans, imu, T_declared[:3, :3], config)
+        return replace(found, rotation=None, translation=None, astray=astray, planes=planes)
     if surer is not path:
         found = _compared(surer, imu, T_guess, T_declared)
     # Undistorted at constant rates, a fast turn bends the path by as much as a wrong scale.
@@ -163,7 +167,9 @@ def _compare(
         # The gyroscope agreed with the first path: where it does not agree with the second, that has gone astray.
         if again.rotation is not None and again.rotation.explained > _EXPLAINED:
             found = again
-    planes = None if T_declared is None else plane_tilt(found.path, scans, imu, T_declared[:3, :3], config)
+    planes = None
+    if T_declared is not None and found.rotation is not None:
+        planes = plane_tilt(found.path, scans, imu, T_declared[:3, :3], config)
     before = corrected_points(found.path, found.rotation, scans, imu, config, guesses)
     return replace(found, planes=planes, astray=astray, corrected=before)
 

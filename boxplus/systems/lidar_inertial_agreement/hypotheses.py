@@ -63,7 +63,10 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
         T_declared: (4, 4) T_imu_lidar in use; None where it is an estimate of the same data.
     """
     rotation, translation = agreement.rotation, agreement.translation
-    if rotation is None or not _path_counts(agreement):
+    if rotation is None:
+        planes = _of_planes(agreement)
+        return [] if planes is None else [planes]
+    if not _path_counts(agreement):
         return []
     found = (
         _of_unit(rotation)

@@ -9,6 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
+from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.scan import Scan
 from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar, faults, mounting
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import sites, worlds
@@ -17,6 +19,8 @@ from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
+from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data
 
 LIDAR = SpinningLidar(channels=24, azimuth_steps=120)
@@ -112,3 +116,21 @@ def test_a_path_that_went_astray_contradicts_nothing() -> None:
     slowed = path.p_path_lidar + np.outer(np.where(seconds < 1.0, 3.0 * seconds, 3.0), [1.0, 0.0, 0.0])
     found = plane_tilt(replace(path, p_path_lidar=slowed), scans, imu, simulation.T_imu_lidar[:3, :3], CONFIG)
     assert found is None or found.tilt < 3.0 * found.std
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("roll_deg", "named"), [(0.0, False), (10.0, True), (25.0, True)])
+def test_planes_speak_where_a_path_drifts_and_nothing_else_can(roll_deg: float, named: bool) -> None:
+    """At a steady speed under a wrong mounting the path lay centimetres off the estimate, and nothing was compared with it."""
+    motion = manoeuvres.constant_velocity(6.0, (-6.0, 0.0, 1.5), (2.0, 0.0, 0.0), manoeuvres.level(0.2))
+    T = mounting(2.0, -3.0, 25.0, (0.1, 0.0, 0.2))
+    scenario = Scenario("hall", worlds.hall(seed=3), motion, SpinningLidar(azimuth_steps=450), T_imu_lidar=T)
+    given = T @ mounting(roll_deg, 0.0, 0.0, (0.0, 0.0, 0.0))
+    odometry = LidarInertialOdometry(LioConfig(T_imu_lidar=tuple(map(tuple, given.tolist()))))
+    for event in Simulation(scenario, seed=3, duration_s=6.0).events():
+        if isinstance(event, Scan):
+            odometry.push_scan(event)
+        elif isinstance(event, ImuSamples):
+            odometry.push_imu(event)
+    odometry.flush()
+    assert (odometry.contradiction is not None and "from upright" in odometry.contradiction) == named

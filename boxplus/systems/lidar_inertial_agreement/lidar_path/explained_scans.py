@@ -31,6 +31,7 @@ _WORSE = 1.3  # times the mean squared distance; sound comparisons reach 1.2, pa
 # the points lie off the surfaces, in shares of what a point far off counts. Before single walls, paths of a narrow view drift by
 # a metre of six, at which up to 0.08 more lie off; under estimates that run away 0.18 and more do.
 _ASTRAY_RAD, _ASTRAY_M, _ASTRAY_SHARE, _FEW_WEAK, _MORE_OFF = 0.2, 0.5, 0.25, 0.1, 0.13
+_TURNS_ALIKE_RAD = 0.02
 _FEWEST_SCANS = 9
 _FIRST, _LAST = 6, 4  # scans of the first and of the last third
 _MOST_MAP_POINTS, _POINTS, _VOXEL_M = 5000, 1500, 0.4
@@ -44,10 +45,12 @@ class Explained:
     Attributes:
         by_path: whether every long segment of the path explains its scans about as well as the expected motion.
         astray: that the expected motion explains them clearly worse, and leads elsewhere; None where it does not.
+        turns_alike: whether both turn alike all the way, so that attitudes may be taken from the path, though nothing else.
     """
 
     by_path: bool
     astray: Finding | None
+    turns_alike: bool
 
 
 def explained_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[Twist], config: RegistrationConfig) -> Explained:
@@ -60,7 +63,7 @@ def explained_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[T
         config: sizes of map cells, and how far a point may lie from its plane.
     """
     time_ns, R, p = _reckoned(scans, expected)
-    by_path, astray = True, None
+    by_path, astray, turns_alike = True, None, True
     for segment in np.unique(path.segment):
         part = path.part(path.segment == segment)
         chosen = scans_of(part.time_ns, scans)
@@ -68,6 +71,7 @@ def explained_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[T
         other = time_ns[numbers], R[numbers], p[numbers]
         if len(chosen) < _FEWEST_SCANS or one_motion(part.poses, other):
             continue
+        turns_alike = turns_alike and _apart(part.poses, other)[0] < _TURNS_ALIKE_RAD
         own_misfit, other_misfit = _misfit(chosen, part.poses, config), _misfit(chosen, other, config)
         by_path = by_path and own_misfit <= _WORSE * other_misfit
         more_off = (other_misfit - own_misfit) / config.plane_threshold**2
@@ -77,7 +81,7 @@ def explained_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[T
             # Where all but a few things go along with the LiDAR, as on a highway, it is the path that has gone astray.
             if not explains_changes(chosen, turning_through(other[0], other[1], np.array([rate for rate, _ in twists])), twists):
                 astray = _astray(part.poses, other, more_off)
-    return Explained(by_path, astray)
+    return Explained(by_path, astray, turns_alike)
 
 
 def _astray(own: Poses, other: Poses, more_off: float) -> Finding:
