@@ -35,8 +35,6 @@ from numpy.typing import NDArray
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.config import LocalMapConfig
-from boxplus.maps.tiles.layout import split_by_tile
-from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.runs.saved_map.places import along, over_ground
 from boxplus.runs.saved_map.saved_map import SavedMap
 from boxplus.runs.saved_map.tiled_points import TiledPoints
@@ -185,8 +183,7 @@ def map_of(drive: DriftingDrive, config: LocalMapConfig, kind: str = "right", sc
         T_turned = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
         points, poses = se3.act(T_turned, points), se3.compose(T_turned, poses)
     points = points.astype(np.float32)
-    tiles = dict(split_by_tile(points[first_per_voxel(points, config.voxel)], 32.0))
-    tiled = TiledPoints(tiles, 32.0, lambda index: tiles[index])
+    tiled = TiledPoints.of(points, config.voxel)
     if kind == "cloud":
         places, _ = over_ground(tiled, tiled.near, config)
         return SavedMap(Path("simulated"), "simulated", places, [], config.voxel, [], tiled)

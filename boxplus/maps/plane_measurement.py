@@ -171,10 +171,8 @@ class PlaneMeasurement:
         """
         config = self._config
         covariance, work = np.empty((2, 6, 6))
-        if not cholesky_inverse_into(
-            np.ascontiguousarray(information[:6, :6]), covariance, work
-        ):  # nothing at all measures some direction
-            return False
+        if not cholesky_inverse_into(np.ascontiguousarray(information[:6, :6]), covariance, work):
+            return False  # nothing at all measures some direction
         mean_leverage = 6.0 / max(used, 1)
         refused = confirm_planes(
             self._tree.view(),

@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.maps.local_maps.config import LocalMapConfig
-from boxplus.maps.tiles.layout import split_by_tile
-from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.runs.saved_map.places import over_ground
 from boxplus.runs.saved_map.saved_map import SavedMap
 from boxplus.runs.saved_map.tiled_points import TiledPoints
@@ -19,7 +17,6 @@ from boxplus.systems.localization.localizer import Localizer
 
 _FOOT_M = 0.3048
 _MOST_POINTS = 20_000_000  # that are copied for it
-_TILE = 32.0  # m
 _READINGS: tuple[tuple[str, str, NDArray[np.float64]], ...] = (
     ("in feet", "multiply its points by 0.3048", _FOOT_M * np.eye(3)),
     ("mirrored", "give one of its axes the other sign", np.diag([1.0, -1.0, 1.0])),
@@ -50,7 +47,6 @@ def other_reading(saved: SavedMap, localizer: Localizer, config: LocalMapConfig)
 
 
 def _as_map(saved: SavedMap, points: NDArray[np.float32], config: LocalMapConfig) -> SavedMap:
-    tiles = dict(split_by_tile(points[first_per_voxel(points, saved.voxel)], _TILE))
-    tiled = TiledPoints(tiles, _TILE, lambda index: tiles[index])
-    places = over_ground(tiled, tiled.near, config)[0] if tiles else []
+    tiled = TiledPoints.of(points, saved.voxel)
+    places = over_ground(tiled, tiled.near, config)[0] if tiled.tiles else []
     return SavedMap(saved.path, saved.kind, places, [], saved.voxel, [], tiled)

@@ -17,7 +17,7 @@ from boxplus.formats.output import advice_to_put_back
 from boxplus.formats.trajectory import Trajectory
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import LocalMap
-from boxplus.maps.tiles.layout import MANIFEST, TileIndex, split_by_tile, tile_folder
+from boxplus.maps.tiles.layout import MANIFEST, TileIndex, tile_folder
 from boxplus.maps.tiles.store import TileStore
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.runs.fleet.recordings import is_recording
@@ -30,7 +30,6 @@ from boxplus.runs.storage.output_folder import doubts_of, program_of
 _SPREAD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 _MARKER = 1e18  # m, and beyond: no coordinates
 _ROUNDING = 0.01  # m, by which a point may lie outside of its tile
-_TILE = 32.0  # m, in memory, of a cloud from a file
 _ALONE_M, _MOST_ALONE, _FEWEST = 2.0, 0.9, 1000  # points alone in a cube of such an edge show no surface; share, and number
 _WHAT = "a folder of 'boxplus lio', 'slam' or 'map merge', a map folder with tiles, or a PLY, PCD, LAS, LAZ or E57 file"
 
@@ -221,8 +220,7 @@ def _of_file(path: Path, voxel: float, damage: list[str]) -> tuple[TiledPoints, 
             f"{far} of {len(points)} points lie farther than {FARTHEST_M / 1e3:.0f} km from the origin and are left out"
         )
         points = points[is_near]
-    tiles = dict(split_by_tile(points[first_per_voxel(points, voxel)], _TILE))
-    return TiledPoints(tiles, _TILE, lambda index: tiles[index]), origin
+    return TiledPoints.of(points, voxel), origin
 
 
 def _refuse_another_unit(path: Path, points: NDArray[np.float32]) -> None:

@@ -8,11 +8,13 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from boxplus.maps.tiles.layout import TileIndex
+from boxplus.maps.tiles.layout import TileIndex, split_by_tile
+from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 
 Points = NDArray[np.float32]
 
 _KEPT = 5_000_000  # points in memory
+_TILE = 32.0  # m, of a cloud in memory
 
 
 class TiledPoints:
@@ -31,6 +33,12 @@ class TiledPoints:
         self._low = np.array(self.tiles, dtype=np.float64).reshape(-1, 3) * size
         self._kept: OrderedDict[TileIndex, Points] = OrderedDict()
         self._points = 0
+
+    @classmethod
+    def of(cls, points: Points, voxel: float) -> TiledPoints:
+        """Of a cloud (N, 3) in memory, thinned to one point a voxel [m]."""
+        tiles = dict(split_by_tile(points[first_per_voxel(points, voxel)], _TILE))
+        return cls(tiles, _TILE, lambda index: tiles[index])
 
     def near(self, centre: ArrayLike, radius: float) -> Points:
         """(N, 3) float32 within `radius` [m] of `centre` (3,)."""

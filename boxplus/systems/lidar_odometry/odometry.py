@@ -194,7 +194,7 @@ class LidarOdometry(Snapshots):
             self._datum = MapDatum(nav_state(self._state).pack(), unknown, SHARED_ERRORS)
         (first, *rest), self._waiting = self._waiting, []
         p_lidar = _deskewed(first, found.motion)
-        self._insert(self._voxel_filter(p_lidar)[1])
+        self._insert(nav_state(self._state).to_world(self._voxel_filter(p_lidar)[1]))
         self._warnings = [text for text in (self._gap, found.warning) if text]
         return [self._estimate(first, p_lidar), *self._advance(rest)]
 
@@ -225,17 +225,25 @@ class LidarOdometry(Snapshots):
             self._datum.follow(x, self._cov, self._cov)
         clock.lap("align")
         p_lidar = _deskewed(scan, motion)
+        points_map = p_lidar[self._voxel_filter.representatives]
+        p_world = nav_state(self._state).to_world(points_map)
         if taken or len(self.map) == 0:
-            self._insert(p_lidar[self._voxel_filter.representatives])
+            self._insert(p_world)
         clock.lap("map insertion")
         if taken:
-            self._watch(scan, x, p_lidar[self._voxel_filter.representatives], found)
+            self._watch(scan, x, points_map, p_world, found)
         clock.lap("watch")
         return self._estimate(scan, p_lidar, found, taken, cov_prior[DOF:, DOF:], clock.laps)
 
-    def _watch(self, scan: Scan, x: NDArray[np.float64], p_lidar: NDArray[np.float32], found: Alignment) -> None:
+    def _watch(
+        self,
+        scan: Scan,
+        x: NDArray[np.float64],
+        p_lidar: NDArray[np.float32],
+        p_world: NDArray[np.float64],
+        found: Alignment,
+    ) -> None:
         """What speaks against the estimate x (36,) after a scan that fitted the map; its points (n, 3) as the map has them."""
-        p_world = nav_state(self._state).to_world(p_lidar)
         drift = self._long_baseline.follow(self._state.time_ns, x, p_lidar, p_world, self._datum)
         self._warnings += drift.warnings if drift is not None else []
         text = self._passing.add(scan, self._state, found.last.directions, self.map)
@@ -250,8 +258,7 @@ class LidarOdometry(Snapshots):
         share = float(np.clip(self._voxel_filter.voxel_size / _INDEPENDENT_M, 0.0, 1.0)) ** 2
         return ScanPoints(means[:, :3].astype(np.float32), scan.start_ns + np.rint(means[:, 3]).astype(np.int64), share)
 
-    def _insert(self, p_lidar: NDArray[np.float32]) -> None:
-        p_world = nav_state(self._state).to_world(p_lidar)
+    def _insert(self, p_world: NDArray[np.float64]) -> None:
         self._datum.insert(*self._arrivals.insert_into(self.map, p_world, self._state.time_ns))
 
     def _status(self, scan: Scan, found: Alignment, taken: bool) -> Status:

@@ -170,6 +170,11 @@ def _storeys(best: Candidate, ranked: list[Candidate], config: LocalizationConfi
     )
 
 
+def best_first(candidates: list[Candidate]) -> list[Candidate]:
+    """Those that nothing refuses, then the others, each by how well they fit."""
+    return sorted(candidates, key=lambda candidate: (candidate.refusal is not None, -candidate.fit))
+
+
 def distinct(candidates: list[Candidate]) -> list[Candidate]:
     """The first of each pose: several guesses come to the same one."""
     found: list[Candidate] = []

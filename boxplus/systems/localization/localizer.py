@@ -23,7 +23,16 @@ from boxplus.manifolds.se3 import SE3
 from boxplus.maps.local_maps.builder import LocalMapBuilder
 from boxplus.maps.local_maps.config import LocalMapConfig
 from boxplus.maps.local_maps.local_map import LocalMap
-from boxplus.systems.localization.candidate import Candidate, Query, contradiction, distinct, examine_all, lead, rivalry
+from boxplus.systems.localization.candidate import (
+    Candidate,
+    Query,
+    best_first,
+    contradiction,
+    distinct,
+    examine_all,
+    lead,
+    rivalry,
+)
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import Guess, PlaceImages, same_pose
 from boxplus.systems.localization.map_lengths import MapLengths
@@ -183,10 +192,9 @@ class Localizer:
 
     def believes(self, asked: Asked) -> Candidate | None:
         """The place of a query that this map is believed to have, at once and by itself; None where there is none."""
-        candidates = self._candidates(asked.local_map, asked.T_query_body, asked.scan, [])
+        candidates = best_first(self._candidates(asked.local_map, asked.T_query_body, asked.scan, []))
         if not candidates:
             return None
-        candidates.sort(key=lambda candidate: (candidate.refusal is not None, -candidate.fit))
         best, verdict, _ = rivalry(candidates, self.config)
         is_believed = best is not None and not verdict and lead(best, candidates) >= self.config.least_lead
         return best if is_believed else None
@@ -209,8 +217,7 @@ class Localizer:
             self.last_query = Asked(local_map, scan, T_query_body)
             # What fitted before is asked again: a place that the search misses once stays a rival.
             earlier = [Guess(place, se3.compose(T, local_map.T_odo_map), 0.0) for place, T in self._earlier]
-            candidates = self._candidates(local_map, T_query_body, scan, earlier)
-            candidates.sort(key=lambda candidate: (candidate.refusal is not None, -candidate.fit))
+            candidates = best_first(self._candidates(local_map, T_query_body, scan, earlier))
             T_odo_query = se3.inverse(local_map.T_odo_map)
             fitting = distinct([candidate for candidate in candidates if candidate.fit >= config.least_fit])[:_REMEMBERED]
             self._earlier = [(one.place, se3.compose(one.T_map_query, T_odo_query)) for one in fitting]
