@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -24,13 +25,17 @@ from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 Source = Literal["given", "recording", "estimated", "identity", "none"]
 
 _TURNING_RAD_S = 0.15
-_ESTIMATE = 12.0, 120.0  # length of the stretch, and how far it is looked for [s]
+_ESTIMATE = 12.0, 120.0  # length of a stretch, and how far stretches are looked for [s]
 _CHECK = 6.0, 20.0
+_MOST_STRETCHES = 5  # that are looked at in vain
+# A narrow view that loses hold once leaves nothing of a stretch: pieces of it, as begin and end in shares of its length.
+_PIECES = (0.0, 0.5), (0.25, 0.75), (0.5, 1.0)
 _WIDE_DEG, _WIDE_M = 10.0, 0.3
 _LEVER_EXPLAINED = 0.8
 _LEVER_CAUTION, _LEVER_FLOOR_M = 2.0, 0.01
 _MOST_SIGMAS = 4.0  # of the estimate, that a first run may leave it by
 _LEAST_DEG = 0.3  # what the scans' own errors leave of the rotation
+_MARGIN_NS = 100_000_000  # of samples about the scans of a piece
 _NOBODY_SAYS = "neither --T-imu-lidar, the configuration nor the recording says how the LiDAR is mounted"
 _REMEDY = "give --T-imu-lidar for the best result"
 _UNIT_ADVICE = "give --gyro-unit"
@@ -87,8 +92,8 @@ def choose_extrinsic(recording: Recording, config: LioConfig, *, should_stop: Ca
     """The extrinsic from the configuration, else from the recording's static transforms, else estimated.
 
     Either way gyroscope, accelerometer and LiDAR are compared over the first seconds of rotation (`compare_sensors`): without a
-    given extrinsic that comparison is the estimate of its rotation and translation, with their standard deviations; with one,
-    what it contradicts becomes a warning. What the motion does not determine stays at the identity and keeps a wide standard
+    given extrinsic that comparison is the estimate of its rotation and translation, with their standard deviations, and goes on
+    to later seconds where the first ones do not show it; with one, what it contradicts becomes a warning. What the motion does not determine stays at the identity and keeps a wide standard
     deviation. An estimate is then refined by a first run over the beginning (`rehearsal`).
 
     Args:
@@ -103,11 +108,10 @@ def choose_extrinsic(recording: Recording, config: LioConfig, *, should_stop: Ca
     if not recording.info.imu_topic:
         return Extrinsic(np.eye(4), "none", "no IMU takes part: poses are those of the LiDAR", False, "")
     known = _known_extrinsic(recording, config)
-    stretch = _turning_stretch(recording, *(_CHECK if known is not None else _ESTIMATE))
-    agreement = None
-    if stretch is not None:
-        declared = None if known is None else known.T_imu_lidar
-        agreement = compare_sensors(*stretch, config, T_declared=declared, refine=known is None)
+    should_stop = should_stop or (lambda: False)
+    declared = None if known is None else known.T_imu_lidar
+    agreement = _compared(recording, config, declared, should_stop)
+    if agreement is not None:
         found = contradictions(agreement, declared)
         for finding in found:
             if finding.cause == "gyro_unit":
@@ -115,9 +119,47 @@ def choose_extrinsic(recording: Recording, config: LioConfig, *, should_stop: Ca
                     f"angular velocities in {recording.info.gyro_unit}, as they are read", finding.text, _UNIT_ADVICE
                 )
         text = "; ".join(finding.text for finding in found)
-        chosen = _rehearsed(recording, config, _estimated(agreement), should_stop or (lambda: False)) if known is None else known
+        chosen = known if known is not None else _rehearsed(recording, config, _estimated(agreement), should_stop)
         return replace(chosen, warning="; ".join(filter(None, [text, chosen.warning])), contradiction=text)
     return known if known is not None else _estimated(None)
+
+
+def _compared(
+    recording: Recording, config: LioConfig, declared: NDArray[np.float64] | None, should_stop: Callable[[], bool]
+) -> Agreement | None:
+    """The sensors over the first stretch that turns; without a declared mounting over the first that shows all of its rotation.
+
+    Where none does it is the one that shows most of it, or the first one; None without scans and samples.
+    """
+    if declared is not None:
+        for stretch in _turning_stretches(recording, *_CHECK):
+            return compare_sensors(*stretch, config, T_declared=declared)
+        return None
+    best: Agreement | None = None
+    for stretch in islice(_turning_stretches(recording, *_ESTIMATE), _MOST_STRETCHES):
+        found = [compare_sensors(*stretch, config, refine=True)]
+        if not np.isfinite(_open_rad(found[0])):
+            found += [compare_sensors(*piece, config, refine=True) for piece in _pieces_of(*stretch) if not should_stop()]
+        best = min(found if best is None else [best, *found], key=_open_rad)
+        if _open_rad(best) < np.radians(_WIDE_DEG) or should_stop():
+            break
+    return best
+
+
+def _open_rad(agreement: Agreement) -> float:
+    """Standard deviation of the mounting's rotation about the axis that is known worst; infinite where rotations tell nothing."""
+    rotation = agreement.rotation
+    return np.inf if rotation is None or not judges_rotation(agreement) else float(rotation.rotation_std[0][-1])
+
+
+def _pieces_of(scans: list[Scan], imu: ImuSamples) -> Iterator[tuple[list[Scan], ImuSamples]]:
+    """Pieces of a stretch."""
+    first_ns, length_ns = scans[0].end_ns, scans[-1].end_ns - scans[0].end_ns
+    for begin, end in _PIECES:
+        piece = [scan for scan in scans if begin * length_ns <= scan.end_ns - first_ns <= end * length_ns]
+        if piece:
+            inside = (imu.time_ns > piece[0].start_ns - _MARGIN_NS) & (imu.time_ns < piece[-1].end_ns + _MARGIN_NS)
+            yield piece, imu.where(inside)
 
 
 def _known_extrinsic(recording: Recording, config: LioConfig) -> Extrinsic | None:
@@ -204,11 +246,15 @@ def _rehearsed(recording: Recording, config: LioConfig, found: Extrinsic, should
     return _guessed(rehearsal.T_imu_lidar, how, rehearsal.std_deg, rehearsal.std_m, open_axes=False)
 
 
-def _turning_stretch(events: Iterable[Event], length_s: float, search_s: float) -> tuple[list[Scan], ImuSamples] | None:
-    """Scans and samples of the first seconds in which the IMU turns, in bounded memory; None where there are not both."""
+def _turning_stretches(events: Iterable[Event], length_s: float, search_s: float) -> Iterator[tuple[list[Scan], ImuSamples]]:
+    """Scans and samples of the seconds in which the IMU turns, one stretch after the other, in bounded memory.
+
+    Where it never turns, the last seconds that were looked at; nothing where there are not both.
+    """
     scans: list[Scan] = []
     blocks: list[ImuSamples] = []
     first_ns = begin_ns = None
+    none_yet = True
     for event in events:
         now_ns = end_ns(event)
         if now_ns is None:
@@ -221,12 +267,16 @@ def _turning_stretch(events: Iterable[Event], length_s: float, search_s: float) 
         elif len(event):
             # Of several LiDARs the first alone: a wrong pose of another one must not look like a wrong one of the first.
             scans.append(thinned(event if event.lidar is None else event.of_lidar(0), _MOST_POINTS))
-        since_s = (now_ns - (first_ns if begin_ns is None else begin_ns)) * 1e-9
-        if since_s > (search_s if begin_ns is None else length_s):
-            break
-        if begin_ns is None:  # keep what would be compared if it never turned
+        if begin_ns is None:
+            if now_ns - first_ns > search_s * 1e9:
+                break
+            # Keep what would be compared if it never turned.
             scans = [scan for scan in scans if scan.end_ns > now_ns - length_s * 0.5e9]
             blocks = [block for block in blocks if block.time_ns[-1] > now_ns - length_s * 0.5e9]
-    if not blocks or not scans:
-        return None
-    return scans, ImuSamples.joined(blocks)
+        elif now_ns - begin_ns > length_s * 1e9:
+            if blocks and scans:
+                yield scans, ImuSamples.joined(blocks)
+                none_yet = False
+            scans, blocks, begin_ns = [], [], None
+    if blocks and scans and (none_yet or begin_ns is not None):
+        yield scans, ImuSamples.joined(blocks)
