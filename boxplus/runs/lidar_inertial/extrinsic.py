@@ -93,8 +93,9 @@ def choose_extrinsic(recording: Recording, config: LioConfig, *, should_stop: Ca
 
     Either way gyroscope, accelerometer and LiDAR are compared over the first seconds of rotation (`compare_sensors`): without a
     given extrinsic that comparison is the estimate of its rotation and translation, with their standard deviations, and goes on
-    to later seconds where the first ones do not show it; with one, what it contradicts becomes a warning. What the motion does not determine stays at the identity and keeps a wide standard
-    deviation. An estimate is then refined by a first run over the beginning (`rehearsal`).
+    to later seconds where the first ones do not show it; with one, what it contradicts becomes a warning. What the motion does
+    not determine stays at the identity and keeps a wide standard deviation. An estimate is then refined by a first run over the
+    beginning (`rehearsal`).
 
     Args:
         recording: opened.
