@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.iterated_update import Posterior
-from boxplus.filtering.nav_state import BA, BW, PL, RL, T_BA, T_BW, TANGENT, P, R, V, boxminus_into
+from boxplus.filtering.nav_state import BA, BW, PL, RL, T_BA, T_BW, T_THETA_L, TANGENT, P, R, V, boxminus_into
 from boxplus.manifolds import so3
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
@@ -138,7 +137,7 @@ class Consistency:
         boxminus_into(x, x_prior, correction)
         stuck = self._stuck.update(frame.imu, measured, x_before[BW : BW + 3])
         warnings = self._span(frame) + self._contradicting("stuck", stuck)
-        warnings += self._innovate(frame, correction, update.cov_prior, posterior)
+        warnings += self._innovate(frame, correction, update)
         warnings += self._fit(frame, fitting_share)
         warnings += self._biases(x, posterior.cov)
         warnings += self._steadiness(frame, update)
@@ -169,10 +168,12 @@ class Consistency:
         """No more scans will come; returns a contradiction that is new."""
         return self._watch.finish()
 
-    def _innovate(
-        self, frame: Frame, correction: NDArray[np.float64], cov_prior: NDArray[np.float64], posterior: Posterior
-    ) -> list[str]:
-        """The correction of the pose against what the prediction's covariance allows, along the directions that were measured."""
+    def _innovate(self, frame: Frame, correction: NDArray[np.float64], update: MountedUpdate) -> list[str]:
+        """The correction of the pose against what the prediction's covariance allows, along the directions that were measured.
+
+        With the mounting known: what the pose of the IMU moves because the mounting does is no contradiction.
+        """
+        posterior, cov_prior = update.posterior, update.cov_prior
         x, directions = posterior.x, posterior.last.directions
         speed = float(np.linalg.norm(x[V : V + 3]))
         if speed > _FASTEST_M_S:
@@ -183,7 +184,7 @@ class Consistency:
             return []
         scale = np.array([directions.lever_arm] * 3 + [1.0] * 3)
         strong = directions.vectors[:, ~directions.weak].T * scale
-        off = strong @ correction[:6]
+        off = strong @ (correction[:6] - update.B_prior[:6] @ correction[T_THETA_L:TANGENT])
         variance = np.einsum("ij,jk,ik->i", strong, cov_prior[:6, :6], strong) + (strong**2) @ _MEASUREMENT_SIGMA**2
         now = float(np.max(off**2 / variance))
         self._innovation = _INNOVATION_KEEP * self._innovation + (1.0 - _INNOVATION_KEEP) * min(now, _ONE_SCAN)
