@@ -83,3 +83,12 @@ def test_a_narrow_view_of_a_wall_without_a_mounting_is_followed_to_centimetres(s
     truth = read_trajectory(folder / "v201_livox.gt.tum", "tum")
     found = evaluate(read_trajectory(tmp_path / "run" / "trajectory.csv"), truth, method="interpolate")
     assert found.ate.rmse < 0.03
+
+
+@pytest.mark.slow
+def test_a_drive_that_finds_its_mounting_on_the_way_is_not_contradicted_for_it(shared_data: Path, tmp_path: Path) -> None:
+    """In its first curve the mounting moves by 20 cm, and with it the IMU on a LiDAR that goes on as predicted."""
+    with open_recording(shared_data / "recordings" / "kitti_0926_0005_ros2") as recording:
+        summary = run_odometry(recording, tmp_path / "run", RunConfig(map=MapConfig(save=False)))
+    assert summary.extrinsic.source == "estimated" and set(summary.status) == {"ok"}
+    assert summary.contradiction is None

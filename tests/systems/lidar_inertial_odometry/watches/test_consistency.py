@@ -13,6 +13,7 @@ from boxplus.filtering.nav_state import BA, BW, T_P, TANGENT, NavState, P, V
 from boxplus.manifolds import so3
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import first_sensitivity
 from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
 
 PERIOD_NS = 100_000_000
@@ -68,18 +69,29 @@ def test_a_bias_that_changes_by_more_than_any_sensor_does_is_a_contradiction(
 
 
 def innovate(
-    corrections: list[np.ndarray], samples: int = 10, weak: tuple[int, ...] = (), v: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    corrections: list[np.ndarray],
+    samples: int = 10,
+    weak: tuple[int, ...] = (),
+    v: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    mounting: np.ndarray | None = None,
+    B: np.ndarray | None = None,
 ) -> tuple[Consistency, list[list[str]]]:
-    """Corrections of the pose (6,), a scan each at 10 Hz, of a prediction that is good for 0.1 mm."""
+    """Corrections of the pose (6,), a scan each at 10 Hz, of a prediction that is good for 0.1 mm.
+
+    With each that of the `mounting` (6,), with which the pose moves by `B` (18, 6).
+    """
     consistency, found = Consistency(LioConfig()), []
     directions = SimpleNamespace(weak=np.isin(np.arange(6), weak), vectors=np.eye(6), lever_arm=10.0)
     for number, pose in enumerate(corrections):
-        correction = np.concatenate([pose, np.zeros(TANGENT - 6)])
+        correction = np.concatenate([pose, np.zeros(TANGENT - 12), np.zeros(6) if mounting is None else mounting])
         x = NavState.identity().pack()
         x[P : P + 3], x[V : V + 3] = pose[T_P : T_P + 3], v
         posterior: Any = SimpleNamespace(x=x, valid=True, last=SimpleNamespace(directions=directions))
         frame: Any = SimpleNamespace(scan=SimpleNamespace(end_ns=number * PERIOD_NS), imu=range(samples))
-        found.append(consistency._innovate(frame, correction, 1e-8 * np.eye(TANGENT), posterior))
+        update: Any = SimpleNamespace(
+            posterior=posterior, cov_prior=1e-8 * np.eye(TANGENT), B_prior=np.zeros((18, 6)) if B is None else B
+        )
+        found.append(consistency._innovate(frame, correction, update))
     return consistency, found
 
 
@@ -106,6 +118,20 @@ def test_a_few_scans_apart_or_along_what_they_do_not_show_are_no_contradiction(o
     assert innovate(([off] * 3 + [np.zeros(6)] * 17) * 3)[0].contradiction is None
     assert innovate([off] * 40, weak=(2, 3))[0].contradiction is None
     assert innovate([off] * 40, weak=(0, 4))[0].contradiction is not None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_the_imu_moves_with_its_mounting_is_no_contradiction(seed: int) -> None:
+    """The LiDAR stays where it is, and the IMU goes elsewhere on it; a pose that moves by more than that is contradicted."""
+    random = np.random.default_rng(seed)
+    x = NavState.identity()
+    x = replace(x, R_imu_lidar=so3.exp(random.normal(size=3)), p_imu_lidar=random.normal(size=3))
+    B = first_sensitivity(x.pack())
+    mounting = np.concatenate([0.01 * random.normal(size=3), 0.1 * random.normal(size=3)])
+    moved = (B @ mounting)[:6]
+    assert innovate([moved] * 40, mounting=mounting, B=B)[0].contradiction is None
+    assert innovate([moved] * 40)[0].contradiction is not None
+    assert innovate([moved + 0.1 * ALONG_X] * 40, mounting=mounting, B=B)[0].contradiction is not None
 
 
 def test_a_speed_that_no_platform_has_is_a_contradiction_at_once() -> None:
