@@ -30,6 +30,7 @@ from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconst
 from boxplus.systems.bundle_adjustment.sightings import Sightings, colmap_layout, colmap_pinhole
 
 _CHANCE = 1e-4  # of noise to lower the cost by as much
+_MANY, _MOST_F = 100, 20.0  # measurements, of which the quantile of F at that chance stays below (16.5 for a single number)
 _HINT = 0.3  # of the fall of the cost that counts, which the first step that is taken has to show
 _CHANGED = 0.01  # of the pixels' distance from the principal point, by which they move; less is what calibrations differ by
 _MORE_STEPS = 0.2  # of the cost, which no further steps gain after as many as were allowed
@@ -145,11 +146,16 @@ class _Freed:
     numbers: int
 
 
-def _by_chance(numbers: int, left: int) -> float:
+def _by_chance(numbers: int, left: int, least: float = 0.0) -> float:
     """Share by which noise lowers a cost where `numbers` more may move and `left` measurements are left over then: an F-test.
 
     The noise is that of the errors, not what sigma says. Of few measurements these know it badly, which counts.
+
+    Args:
+        least: what matters of it; a share that is surely below need not be known.
     """
+    if left >= _MANY and numbers / left * _MOST_F < least:
+        return 0.0
     from scipy.special import fdtri  # here, as most runs never ask, and it takes longer to import than they to adjust
 
     return numbers / left * float(fdtri(numbers, left, 1.0 - _CHANCE))
@@ -194,7 +200,7 @@ def _freed(
     numbers = sum(block.values.size - len(block) * len(held) for block in lenses) - count
     if not 0 < numbers < left:
         return None
-    share = _by_chance(numbers, left - numbers)
+    share = _by_chance(numbers, left - numbers, least)
     if solved.limit == "steps":  # more steps would lower the cost without another lens, too
         share = max(share, _MORE_STEPS)
     share = max(share, least)
