@@ -96,6 +96,14 @@ def right_jacobian_inverse_into(wx: float, wy: float, wz: float, J: NDArray[np.f
 
 
 @kernel(inline=True)
+def product_into(A: NDArray[np.float64], B: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    """out = A B, all (3, 3); out is neither A nor B."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+
+
+@kernel(inline=True)
 def quaternion_scalars(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
     """Unit quaternion (w, x, y, z) of R with w ≥ 0, by the largest element (Shepperd; docs/manifolds.md)."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]

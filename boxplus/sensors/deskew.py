@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
 from boxplus.filtering.propagation import N_A, N_P, N_R, N_TIME, N_V, N_W
-from boxplus.manifolds.so3 import exp_into
+from boxplus.manifolds.so3 import exp_into, product_into
 
 # Exp(ω s) = Σ [ω]ᵏ sᵏ / k!; what follows k = 3 turns a point by at most θ⁴ / 24, θ = |ω s| (the remainder of a series whose
 # derivatives are rotations times [ω]ᵏ). In half a piece θ ≤ 0.03: at most 3.4e-8 rad, half of what float32 resolves.
@@ -141,7 +141,7 @@ def _cut(
         wx, wy, wz = node[N_W], node[N_W + 1], node[N_W + 2]
         hat[0, 1], hat[0, 2], hat[1, 2] = -wz, wy, -wx
         hat[1, 0], hat[2, 0], hat[2, 1] = wz, -wy, wx
-        _product(R_back, node[N_R : N_R + 9].reshape(3, 3), M)
+        product_into(R_back, node[N_R : N_R + 9].reshape(3, 3), M)
         for i in range(3):
             c[0, i], c[1, i], c[2, i] = 0.0, 0.0, 0.0
             for k in range(3):
@@ -154,16 +154,16 @@ def _cut(
             middle_ns = _middle(begin_ns[at], node_ns[m] + length * (part + 1) // parts[m])
             s = (middle_ns - (first_ns if m == 0 else node_ns[m])) * _NS
             exp_into(wx * s, wy * s, wz * s, turn)
-            _product(M, turn, E)
+            product_into(M, turn, E)
             scale = 1.0
             for power in range(_POWERS):  # E = M Exp(ω s) [ω]^power, scale = 1 ns^power / power!
                 polynomial = pieces[at, power * _ROW : (power + 1) * _ROW]
-                _product(E, R_L, next_E)
+                product_into(E, R_L, next_E)
                 for i in range(3):
                     for j in range(3):
                         polynomial[3 * i + j] = scale * next_E[i, j]
                     polynomial[9 + i] = scale * (E[i, 0] * x_end[PL] + E[i, 1] * x_end[PL + 1] + E[i, 2] * x_end[PL + 2])
-                _product(E, hat, next_E)
+                product_into(E, hat, next_E)
                 E, next_E = next_E, E
                 scale *= _NS / (power + 1)
             for i in range(3):
@@ -172,11 +172,3 @@ def _cut(
                 pieces[at, 2 * _ROW + 9 + i] += c[2, i] * _NS**2
             at += 1
     return begin_ns, pieces
-
-
-@kernel(inline=True)
-def _product(A: NDArray[np.float64], B: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """out (3, 3) = A B."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus._jit import kernel
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
-from boxplus.manifolds.so3 import exp_into
+from boxplus.manifolds.so3 import exp_into, product_into
 
 Floats = NDArray[np.float64]
 
@@ -67,14 +67,6 @@ def span_of(trajectory: Trajectory, name: str, duration_s: float | None) -> tupl
     return trajectory.start_ns, min(trajectory.start_ns + round(duration * 1e9), trajectory.end_ns), duration
 
 
-@kernel(inline=True)
-def _multiply(A: Floats, B: Floats, C: Floats) -> None:
-    """C = A B, all (3, 3); C is neither A nor B."""
-    for i in range(3):
-        for j in range(3):
-            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-
-
 @kernel
 def _evaluate(
     offset_s: Floats,
@@ -121,7 +113,7 @@ def _evaluate(
         for j in range(3):
             sx, sy, sz = step_control[i + j, 0], step_control[i + j, 1], step_control[i + j, 2]
             exp_into(weight[j] * sx, weight[j] * sy, weight[j] * sz, E)
-            _multiply(A, E, B)
+            product_into(A, E, B)
             for k in range(3):
                 for m in range(3):
                     A[k, m] = B[k, m]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.filtering.propagation import N_A, N_P, N_R, N_TIME, N_V, N_W
-from boxplus.manifolds.so3 import exp_into, log_into, right_jacobian_into, right_jacobian_inverse_into
+from boxplus.manifolds.so3 import exp_into, log_into, product_into, right_jacobian_into, right_jacobian_inverse_into
 
 _RATE, _TURN, _TURN_RATE, _FIRST = 0, 1, 2, 3
 _DOF = 12
@@ -67,7 +67,7 @@ def nodes_into(
     log = np.empty(3)
     for n in range(count):
         exp_into(turn[n, 0], turn[n, 1], turn[n, 2], since)
-        _multiply(R_world_first, since, R_next)
+        product_into(R_world_first, since, R_next)
         if n:
             node, step = nodes[n - 1], seconds[n] - seconds[n - 1]
             for i in range(3):
@@ -113,9 +113,9 @@ def jacobians_into(
         along[0, 0] = along[1, 1] = along[2, 2] = c
         along[0, 1], along[0, 2], along[1, 2] = wz, -wy, wx
         along[1, 0], along[2, 0], along[2, 1] = -wz, wy, -wx
-        _multiply(bend, along, bent)
+        product_into(bend, along, bent)
         # From the point's own turning to the last pose's: about its axes, and as a motion of what lies away from it.
-        _multiply(R_world_first, since, attitude)
+        product_into(R_world_first, since, attitude)
         rx, ry, rz = p[n, 0] - ends[_FIRST + 2, 0], p[n, 1] - ends[_FIRST + 2, 1], p[n, 2] - ends[_FIRST + 2, 2]
         for j in range(3):
             gx, gy, gz = attitude[0, j], attitude[1, j], attitude[2, j]
@@ -125,15 +125,15 @@ def jacobians_into(
         for i in range(6):
             for j in range(2 * _DOF):
                 J[n, i, j] = 0.0
-        _multiply(bent, before, product)
+        product_into(bent, before, product)
         for i in range(3):
             for j in range(3):
                 own[i, j] = since[j, i] - product[i, j]
         _set_columns(J[n], 0, 1.0, about_last, moving, own)
         _set_columns(J[n], 6, b, about_last, moving, bend)
-        _multiply(bent, after, own)
+        product_into(bent, after, own)
         _set_columns(J[n], _DOF, 1.0, about_last, moving, own)
-        _multiply(bend, after, own)
+        product_into(bend, after, own)
         _set_columns(J[n], _DOF + 6, d, about_last, moving, own)
         for i in range(3):
             J[n, 3 + i, 3 + i], J[n, 3 + i, 9 + i] = a, b
@@ -155,11 +155,3 @@ def _set_columns(
         for i in range(3):
             J[i, column + j] = about_last[i, 0] * x + about_last[i, 1] * y + about_last[i, 2] * z
             J[3 + i, column + j] = moving[i, 0] * x + moving[i, 1] * y + moving[i, 2] * z
-
-
-@kernel
-def _multiply(A: NDArray[np.float64], B: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """out = A B, all (3, 3) and apart."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
