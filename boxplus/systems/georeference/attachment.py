@@ -12,6 +12,7 @@ from boxplus.manifolds import quaternion, se3
 from boxplus.sensors.geodesy import EnuFrame
 from boxplus.sensors.gnss import GnssFixes
 from boxplus.systems.georeference.config import GeoreferenceConfig
+from boxplus.systems.slam.graph import MapGraph
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +28,9 @@ class AttachedFixes:
         time_ns: (N,) of the fixes, in the clock of the odometry.
         lat_lon_alt: (N, 3) [°, °, m]; covariance: (N, 3, 3) east, north, up [m²], what was unknown filled in.
         map_of: (N,) number of the local map; T_map_imu: (N, 7) in its frame; v_map: (N, 3) velocity there [m/s].
+        drift: (N,) standard deviation of an axis by which the odometry drifted from the local map's pose to the fix [m].
+        half_of: (N,) number of the half of a local map, before or after its pose: in one the drift is shared.
+        walked: (N,) variance of an axis that the odometry gained by drifting at random since the first local map [m²].
         left_out: fixes that are not among them, by reason.
     """
 
@@ -36,6 +40,9 @@ class AttachedFixes:
     map_of: NDArray[np.intp]
     T_map_imu: Floats
     v_map: Floats
+    drift: Floats
+    half_of: NDArray[np.intp]
+    walked: Floats
     left_out: Counter[str]
 
     def __len__(self) -> int:
@@ -57,8 +64,7 @@ class AttachedFixes:
 
 def attach(
     fixes: GnssFixes,
-    map_time_ns: NDArray[np.int64],
-    T_odo_map: Floats,
+    graph: MapGraph,
     time_ns: NDArray[np.int64],
     T_odo_imu: Floats,
     config: GeoreferenceConfig,
@@ -66,7 +72,7 @@ def attach(
     """Attach fixes to the local maps nearest in time.
 
     Args:
-        fixes: any number. map_time_ns: (n,), T_odo_map: (n, 7) of the local maps, at least one.
+        fixes: any number. graph: of the local maps, at least one.
         time_ns: (K,) ascending, T_odo_imu: (K, 7) of the odometry.
     """
     left_out = Counter(fixes.rejected)
@@ -79,11 +85,38 @@ def attach(
     if len(keep) > len(chosen):
         left_out["one of several within the interval"] = len(keep) - len(chosen)
     t, T_odo, v_odo = t[chosen], T_odo[chosen], v_odo[chosen]
-    map_of = np.argmin(np.abs(map_time_ns[None, :] - t[:, None]), axis=1)
-    T_map_odo = se3.inverse(T_odo_map[map_of])
+    map_of = np.argmin(np.abs(graph.time_ns[None, :] - t[:, None]), axis=1)
+    T_map_odo = se3.inverse(graph.T_odo[map_of])
     v_map = np.einsum("nab,nb->na", quaternion.to_matrix(T_map_odo[:, :4]), v_odo)
     covariance = _filled(fixes.covariance[chosen], config)
-    return AttachedFixes(t, fixes.lat_lon_alt[chosen], covariance, map_of, se3.compose(T_map_odo, T_odo), v_map, left_out)
+    is_after = t > graph.time_ns[map_of]
+    drift, walked = _drifts(graph, map_of, is_after, T_odo[:, 4:])
+    return AttachedFixes(
+        time_ns=t,
+        lat_lon_alt=fixes.lat_lon_alt[chosen],
+        covariance=covariance,
+        map_of=map_of,
+        T_map_imu=se3.compose(T_map_odo, T_odo),
+        v_map=v_map,
+        drift=drift,
+        half_of=2 * map_of + is_after,
+        walked=walked,
+        left_out=left_out,
+    )
+
+
+def _drifts(graph: MapGraph, map_of: NDArray[np.intp], is_after: NDArray[np.bool_], p_odo: Floats) -> tuple[Floats, Floats]:
+    """`drift` and `walked` of fixes at p_odo (N, 3): of a step from map to map the part that the way has of its way."""
+    if len(graph.T_odo) < 2:
+        return np.zeros(len(p_odo)), np.zeros(len(p_odo))
+    of_step = np.linalg.eigvalsh(graph.covariances[1:, 3:, 3:])[:, -1]
+    p_map = graph.T_odo[:, 4:]
+    step = np.clip(np.where(is_after, map_of, map_of - 1), 0, len(of_step) - 1)
+    way = np.linalg.norm(p_odo - p_map[map_of], axis=1)
+    whole = np.linalg.norm(p_map[step + 1] - p_map[step], axis=1)
+    of_way = of_step[step] * way / np.maximum(whole, np.maximum(way, 1e-9))
+    of_map = np.concatenate([[0.0], np.cumsum(of_step)])[map_of]
+    return np.sqrt(of_way), np.asarray(of_map + np.where(is_after, of_way, -of_way))
 
 
 def poses_between(

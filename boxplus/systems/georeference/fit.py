@@ -110,6 +110,8 @@ def fit(
 
     Errors of fixes stay for tens of seconds, so that fixes nearer to each other than that count as one together: standard
     deviations are multiplied by √(correlation/spacing). The threshold of outliers is divided by it: a fix is judged by its own.
+    Beside its own noise there is what the odometry drifted from the local map to it, which is the same for all fixes made there:
+    where the antenna stands for longer than that, they count as one.
 
     Args:
         attached: N fixes, p_enu: (N, 3) where they are. T_enu_map: (7,) the start, believed: (N,) the fixes it rests on.
@@ -121,6 +123,8 @@ def fit(
     spacing = float(np.median(np.diff(attached.time_ns))) * 1e-9
     inflation = math.sqrt(max(config.correlation / spacing, 1.0))
     threshold = math.sqrt(chi_square_quantile(config.inlier, 3))
+    lasts = np.bincount(attached.half_of)[attached.half_of] / inflation**2
+    of_odometry = (inflation**2 * attached.drift**2 * np.maximum(lasts, 1.0))[:, None, None] * np.eye(3)
     noise_scale = height_scale = 1.0
     arm_start = np.zeros((1, 3)) if lever is None else lever[None]
     start = [graph.T_map, np.repeat(T_enu_map[None], datums, axis=0), arm_start, np.zeros((1, 1))]
@@ -141,7 +145,7 @@ def fit(
         else:
             problem.fix(arm)
         axes = inflation * noise_scale * np.array([1.0, 1.0, height_scale])
-        covariance = axes[:, None] * attached.covariance * axes
+        covariance = axes[:, None] * attached.covariance * axes + of_odometry
         residual = AntennaPosition(p_enu, attached.T_map_imu, attached.v_map, covariance=covariance)
         every = np.zeros(len(attached), dtype=np.intp)
         fixes = problem.add_residuals(residual, world[datum], x[attached.map_of], arm[every], delay[every], name="fixes")

@@ -93,7 +93,7 @@ def georeference(
     """
     config = as_settings(GeoreferenceConfig, config)
     lever = p_imu_antenna if config.lever_arm is None else np.array(config.lever_arm)
-    attached = attach(fixes, graph.time_ns, graph.T_odo, time_ns, T_odo_imu, config)
+    attached = attach(fixes, graph, time_ns, T_odo_imu, config)
     none = Georeference(None, None, None, attached, dict(attached.left_out), [], [])
     try:
         drift = _drift(graph)
@@ -122,6 +122,7 @@ def _start(
             "determined; record a longer way"
         )
     allowed = (_SIGMAS * attached.sigma * sigma / stated) ** 2 + (_SIGMAS * drift[attached.map_of]) ** 2
+    allowed += (_SIGMAS * attached.drift) ** 2
     speed = np.linalg.norm(attached.v_map, axis=1)
     allowed += (2.0 * config.delay_sigma * speed) ** 2
     allowed += 0.0 if lever is not None else (2.0 * config.lever_sigma) ** 2

@@ -14,7 +14,6 @@ from datums.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -78,8 +77,9 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
     is_near = lasts <= max(2.0 * float(np.median(lasts)), _LASTING)  # in a longer gap the odometry drifts
     lasting = (seconds[at] >= _LASTING) & (seconds[-1] - seconds[at] >= _LASTING)
     enough = (at >= _FEWEST) & (at <= len(attached) - _FEWEST)
-    noise = float(np.median(attached.sigma)) * math.sqrt(2.0 / _WINDOW)
-    least = max(_STANDS_OUT * float(np.median(steps)), _NOISY * noise)
+    of_odometry = np.convolve(attached.drift**2, np.full(_WINDOW, 1.0 / _WINDOW), "valid")
+    noise = np.sqrt(float(np.median(attached.sigma)) ** 2 * 2.0 / _WINDOW + of_odometry[_WINDOW:] + of_odometry[:-_WINDOW])
+    least = np.maximum(_STANDS_OUT * float(np.median(steps)), _NOISY * noise)
     left = np.where(is_near & enough & (steps >= least), steps, 0.0)
     sigma = float(np.median(attached.sigma)) * found.noise_scale
     short: Jump | None = None
@@ -99,14 +99,16 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
             continue
         share = float(_steps(split.errors)[largest] / steps[largest])
         gated, before = (int(np.count_nonzero(~own.is_used)) for own in (split, found))
-        step = _sharpest(seconds, found, int(at[largest]), sigma)
-        is_explained = gated <= before if share < _GONE else share < _LESS and gated < _FEWER * before
+        step = _sharpest(seconds, attached, found, int(at[largest]), sigma)
+        freed = before - gated
+        is_explained = freed >= 0 if share < _GONE else share < _LESS and freed >= _WINDOW and gated < _FEWER * before
         # A burst at the step hides what another datum leaves of it.
         is_left = gated <= before and (step.is_beside or (share < _LESS and step.is_told))
         is_left = is_left and _rests_on_both(found, seconds, int(at[largest]), step)
         metres, bend = float(np.linalg.norm(split.datum_step[:2])), _bend(found, split)
-        # Fixes on both sides were gated against a map between the two: a burst gives none of the others back.
-        gives_back = before > 0 and gated <= _HALF * before and bend > OFF_SIGMAS
+        # Fixes on both sides were gated against a map between the two: a burst gives none of the others back, and chance a
+        # few.
+        gives_back = freed >= _WINDOW and gated <= _HALF * before and bend > OFF_SIGMAS
         if gives_back or (not step.is_burst and (is_explained or is_left)):
             # Of the map that lies bent between both the errors step by less: it goes along.
             told = metres if is_explained or gives_back else max(metres, step.alone)
@@ -136,7 +138,7 @@ def _bend(found: Fit, split: Fit) -> float:
     )
 
 
-def _sharpest(seconds: Floats, found: Fit, at: int, sigma: float) -> Step:
+def _sharpest(seconds: Floats, attached: AttachedFixes, found: Fit, at: int, sigma: float) -> Step:
     """The step at a fix or one beside it: means of a few fixes do not tell which.
 
     Bursts of multipath elsewhere, which the map does not rest on, say nothing of it, and a large one would be half of the step.
@@ -147,13 +149,17 @@ def _sharpest(seconds: Floats, found: Fit, at: int, sigma: float) -> Step:
     near = found.is_used.copy()
     for begin, end in found.gated:
         near[begin:end] = begin <= inside[-1] and end >= inside[0]
-    of_all, of_near = (_largest(seconds, found.errors, kept, inside, sigma) for kept in (np.ones_like(near), near))
+    of_all, of_near = (_largest(seconds, attached, found.errors, kept, inside, sigma) for kept in (np.ones_like(near), near))
     return of_all if of_all.is_burst else of_near
 
 
-def _largest(seconds: Floats, errors: Floats, kept: NDArray[np.bool_], inside: range, sigma: float) -> Step:
-    row, e = np.cumsum(kept) - 1, errors[kept, :2]
-    return max((step_at(seconds[kept], e, int(row[k]), sigma) for k in inside if row[k] > 0), key=lambda step: step.gain)
+def _largest(
+    seconds: Floats, attached: AttachedFixes, errors: Floats, kept: NDArray[np.bool_], inside: range, sigma: float
+) -> Step:
+    row, t, e = np.cumsum(kept) - 1, seconds[kept], errors[kept, :2]
+    walked = attached.walked[kept]
+    found = (step_at(t, e, int(row[k]), sigma, walked) for k in inside if row[k] > 0)
+    return max(found, key=lambda step: step.gain)
 
 
 def _steps(errors: Floats) -> Floats:

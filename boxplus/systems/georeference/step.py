@@ -1,9 +1,12 @@
 """A step in the errors of fixes, looked at from near: does it last, and is it one, or does multipath begin or end there?
 
-Half a minute on either side the errors on the ground are a level, a slope (the map bends slowly) and noise: white, and such as
-stays for τ, with the covariance
+Half a minute on either side the errors on the ground are a level, a slope (the map bends slowly) and noise: white, such as stays
+for τ, and what the odometry drifts at random, of variance w since the first of these fixes, with the covariance
 
-    K = σ_w² I + σ_s² exp(−|t − t'| / τ).
+    K = σ_w² I + σ_s² exp(−|t − t'| / τ) + min(w, w').
+
+As few fixes count beside those near to them in time, the map does not bend after every one: without the last, fixes known to
+centimetres step wherever the odometry drifts by more than that.
 
 Generalised least squares says by how much a step there lowers the cost, and by how much a burst does, of any duration, that
 begins or ends there. Either explains what the other does in part: of a datum that jumps, a burst explains little more than the
@@ -75,18 +78,22 @@ class Step:
         return self.gain >= _LEAST and not self.is_burst
 
 
-def step_at(seconds: Floats, errors: Floats, at: int, sigma: float) -> Step:
+def step_at(seconds: Floats, errors: Floats, at: int, sigma: float, walked: Floats | None = None) -> Step:
     """The step between fix `at` and the one before it.
 
     Args:
         seconds: (N,) of the fixes. errors: (N, 2) on the ground [m].
         sigma: standard deviation of a fix that is believed [m], all of which may stay.
+        walked: (N,) variance that the odometry gained by drifting at random, from anywhere on [m²]; none if left out.
     """
     middle = 0.5 * (seconds[at - 1] + seconds[at])
     near = np.flatnonzero(np.abs(seconds - middle) <= _REACH)
     t, e = seconds[near] - middle, errors[near]
     white = 1.4826 * float(np.median(np.abs(np.diff(errors, axis=0)))) / math.sqrt(2.0)
     K = sigma**2 * np.exp(-np.abs(t[:, None] - t) / _STAYS) + max(white, 1e-3 * sigma) ** 2 * np.eye(len(t))
+    if walked is not None:
+        w = np.maximum.accumulate(walked[near] - walked[near[0]])
+        K += np.minimum(w[:, None], w)
     L = np.linalg.cholesky(K)
 
     after, before = t[t > 0.0], t[t < 0.0]

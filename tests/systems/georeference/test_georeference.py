@@ -30,6 +30,7 @@ LEVER = (0.8, -0.3, 1.1)
 STEP = np.array([3.0, 0.0, 0.0])
 GOOD = GnssConfig(sigma=0.3, slow_sigma=0.1, claimed=0.3, lever=LEVER)
 USUAL = GOOD.model_copy(update={"sigma": 0.5, "slow_sigma": 0.5, "claimed": 0.7})
+RTK = GOOD.model_copy(update={"sigma": 0.01, "slow_sigma": 0.01, "claimed": 0.02})
 CONFIG = GeoreferenceConfig()
 
 
@@ -106,12 +107,25 @@ def test_a_jump_is_as_long_as_two_datums_are_apart(laps: Drive) -> None:
     assert jump is not None and jump.metres == pytest.approx(1.5)
 
 
+def of_one_map(attached: AttachedFixes, seconds: np.ndarray) -> AttachedFixes:
+    """Fixes at other times (N,) [s], as exactly known and all where one local map is."""
+    n = len(seconds)
+    return replace(
+        attached,
+        time_ns=(seconds * 1e9).astype(np.int64),
+        covariance=np.tile(attached.covariance[:1], (n, 1, 1)),
+        map_of=np.zeros(n, np.intp),
+        half_of=np.zeros(n, np.intp),
+        drift=np.zeros(n),
+        walked=np.zeros(n),
+    )
+
+
 def test_bursts_near_the_ends_do_not_hide_a_jump(laps: Drive) -> None:
     good = found(laps, GOOD.model_copy(update=PRECISE))
     assert good.fit is not None
     seconds, half = np.arange(300.0), 150.0
-    covariance = np.tile(good.attached.covariance[:1], (300, 1, 1))
-    fixes = replace(good.attached, time_ns=(seconds * 1e9).astype(np.int64), covariance=covariance, map_of=np.zeros(300, np.intp))
+    fixes = of_one_map(good.attached, seconds)
     errors = np.where(seconds[:, None] >= half, [3.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     for begin in (12.0, 278.0):
         errors[(seconds >= begin) & (seconds < begin + 10.0)] += [20.0, 0.0, 0.0]
@@ -131,8 +145,7 @@ def test_bursts_elsewhere_are_no_half_of_a_jump(laps: Drive) -> None:
     good = found(laps, USUAL)
     assert good.fit is not None
     seconds, random = np.arange(93.0), np.random.default_rng(1)
-    covariance = np.tile(good.attached.covariance[:1], (93, 1, 1))
-    fixes = replace(good.attached, time_ns=(seconds * 1e9).astype(np.int64), covariance=covariance, map_of=np.zeros(93, np.intp))
+    fixes = of_one_map(good.attached, seconds)
     errors, used = random.normal(0.0, 0.5, (93, 3)), np.ones(93, dtype=bool)
     for begin, metres in ((11, [-28.9, 9.2, 0.0]), (23, [-1.5, -34.3, 0.0]), (55, [18.6, -10.8, 0.0])):
         errors[begin : begin + 6] += metres
@@ -229,8 +242,7 @@ def test_a_datum_that_gives_gated_fixes_back_is_one_under_any_burst(laps: Drive,
     good = found(laps, USUAL)
     assert good.fit is not None
     seconds, random = np.arange(100.0), np.random.default_rng(1)
-    covariance = np.tile(good.attached.covariance[:1], (100, 1, 1))
-    fixes = replace(good.attached, time_ns=(seconds * 1e9).astype(np.int64), covariance=covariance, map_of=np.zeros(100, np.intp))
+    fixes = of_one_map(good.attached, seconds)
     errors, used = random.normal(0.0, 0.5, (100, 3)), np.ones(100, dtype=bool)
     errors[50:58] += [9.0, -12.0, 0.0]
     used[46:64] = False
@@ -262,6 +274,19 @@ def test_a_datum_that_is_not_determined_is_none(laps: Drive) -> None:
 def test_noise_and_multipath_do_not_contradict_a_map(laps: Drive, receiver: dict[str, object]) -> None:
     result = found(laps, GOOD.model_copy(update=receiver))
     assert result.refusal is None and result.contradiction is None
+
+
+@pytest.mark.parametrize("seed", [2, 4, 8, 10])
+@pytest.mark.parametrize("stops", [[(0.2, 60.0), (0.5, 60.0), (0.8, 60.0)], [(0.0, 90.0), (0.9, 90.0)]])
+@pytest.mark.parametrize("speed", [2.0, 8.0])
+def test_an_antenna_that_stands_makes_no_jump_of_what_the_odometry_drifts(
+    seed: int, stops: list[tuple[float, float]], speed: float
+) -> None:
+    """Within a local map an odometry drifts by more than RTK is off, and all fixes of a stop are off by the same."""
+    here = drive(LAPS, seed, DriftConfig(speed=speed), stops)
+    result = georeference(here.graph, here.fixes(RTK, seed), here.time_ns, here.T_odo_imu, None, np.array(LEVER))
+    assert result.fit is not None and result.contradiction is None
+    assert (here.off(result) / (np.sqrt(2.0) * result.fit.sigma)).max() < 4.0
 
 
 def test_fixes_of_another_vehicle_are_refused(laps: Drive) -> None:
@@ -341,9 +366,7 @@ def test_fixes_outside_of_the_odometry_are_counted(laps: Drive) -> None:
     assert early.refusal is not None and f"{len(fixes)} outside of the odometry's time" in early.refusal
     gap = np.ones(len(laps.time_ns), dtype=bool)
     gap[100:150] = False
-    attached = attach(
-        fixes, laps.graph.time_ns, laps.graph.T_odo, laps.time_ns[gap], laps.T_odo_imu[gap], GeoreferenceConfig(interval=0.0)
-    )
+    attached = attach(fixes, laps.graph, laps.time_ns[gap], laps.T_odo_imu[gap], GeoreferenceConfig(interval=0.0))
     assert attached.left_out["in a gap of the odometry"] > 10
     assert len(attached) + sum(attached.left_out.values()) == len(fixes)
     again = se3.compose(laps.graph.T_odo[attached.map_of], attached.T_map_imu)

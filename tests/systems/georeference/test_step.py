@@ -85,3 +85,15 @@ def test_bursts_in_a_row_are_no_step(bursts: list[tuple[float, tuple[float, floa
             step = step_at(seconds, errors, at, 0.7)
             assert not step.is_beside, (seed, at)
         assert step.is_burst and not step.is_told
+
+
+def test_what_an_odometry_drifts_at_random_is_no_step_and_a_jump_is_one() -> None:
+    random = np.random.default_rng(1)
+    sigma, told, jumps = 0.02, 0, 0
+    for _ in range(40):
+        walked = np.cumsum(np.full(len(SECONDS), 0.03**2))
+        drift = np.cumsum(0.03 * random.standard_normal((len(SECONDS), 2)), axis=0)
+        errors = drift + 0.01 * random.standard_normal((len(SECONDS), 2))
+        told += step_at(SECONDS, errors, 50, sigma, walked).is_told
+        jumps += step_at(SECONDS, errors + np.outer(SECONDS >= 50.0, [0.4, 0.0]), 50, sigma, walked).is_told
+    assert told == 0 and jumps >= 36
