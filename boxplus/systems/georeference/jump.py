@@ -34,6 +34,7 @@ _NOISY = 3.0  # times what noise makes of it
 _GONE = 0.4  # of a step, what another datum leaves of it
 _LESS, _FEWER = 0.8, 0.75  # or so much of it, where of the fixes that fit nothing no more than such a share is left
 _HALF = 0.5  # of the fixes that fit nothing, what another datum leaves where it is what they are of
+_SEEN = 12.0  # by which a step or burst there lowers the cost at least: less is made by noise and by what the odometry drifts
 _TRIED = 4  # steps, the largest first
 _BESIDE = 2  # fixes, by which a step may be off
 _LASTING = 30.0  # s: multipath lasts less, and is no datum
@@ -109,7 +110,8 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
         # Fixes on both sides were gated against a map between the two: a burst gives none of the others back, and chance a
         # few.
         gives_back = freed >= _WINDOW and gated <= _HALF * before and bend > OFF_SIGMAS
-        if gives_back or (not step.is_burst and (is_explained or is_left)):
+        is_seen = max(step.gain, step.burst_gain, step.beside) >= _SEEN
+        if is_seen and (gives_back or (not step.is_burst and (is_explained or is_left))):
             # Of the map that lies bent between both the errors step by less: it goes along.
             told = metres if is_explained or gives_back else max(metres, step.alone)
             jump = Jump(float(seconds[at[largest]]), told, not is_short, bend)
