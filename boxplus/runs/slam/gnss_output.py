@@ -121,7 +121,14 @@ def gnss_facts(topic: str, found: Georeference, correction: Correction) -> GnssF
         delay_sigma_s=fit.delay_sigma,
         noise_scale=fit.noise_scale,
         height_scale=fit.height_scale,
+        unshown_slide_m=None if found.unshown is None else _finite(found.unshown.slide_m),
+        unshown_turn_deg=None if found.unshown is None else _finite(found.unshown.turn_deg),
     )
+
+
+def _finite(value: float) -> float | None:
+    """JSON knows no infinity."""
+    return value if math.isfinite(value) else None
 
 
 def gnss_warnings(found: Georeference, config: GeoreferenceConfig) -> list[str]:

@@ -38,6 +38,10 @@ class GnssFacts(Part):
     delay_sigma_s: float | None = None
     noise_scale: float | None = Field(None, description="factor of the standard deviations that the receiver states")
     height_scale: float | None = Field(None, description="and that of the heights beside it; 1 but where they scatter far more")
+    unshown_slide_m: float | None = Field(
+        None, description="less than this fixes may slide over the recording, and nothing is said: the odometry may drift as much"
+    )
+    unshown_turn_deg: float | None = Field(None, description="and so much they may be turned half way")
 
 
 class SlamSummary(Part):

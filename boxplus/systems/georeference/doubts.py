@@ -14,6 +14,7 @@ from boxplus.systems.georeference.fit import Fit
 from boxplus.systems.georeference.heights import height_jump
 from boxplus.systems.georeference.jump import Jump
 from boxplus.systems.georeference.plateau import Plateau
+from boxplus.systems.georeference.slide import Slide
 
 _MANY_GATED = 0.15
 _LONG = 0.1  # of all fixes, a stretch of gated ones that is more than multipath
@@ -70,6 +71,7 @@ def doubts_of(
     stretches: list[tuple[float, float, float]],
     jump: Jump | None,
     plateau: Plateau | None,
+    slide: Slide | None,
     config: GeoreferenceConfig,
 ) -> list[str]:
     """Sentences about what to doubt, beside what contradicts itself."""
@@ -101,6 +103,8 @@ def doubts_of(
         warnings.append(_of_plateau(plateau))
     if jump is not None and not jump.contradicts(found):
         warnings.append(_of_jump(jump))
+    if slide is not None:
+        warnings.append(slide.text)
     if found.noise_scale > NOISY:
         warnings.append(
             f"fixes scatter {found.noise_scale:.1f} times as much as they claim, or the odometry does between two local maps; "

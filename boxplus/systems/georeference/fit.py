@@ -25,6 +25,7 @@ from boxplus.residuals.prior import Prior
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.systems.georeference.attachment import AttachedFixes
 from boxplus.systems.georeference.config import GeoreferenceConfig
+from boxplus.systems.georeference.shifts import Shifts
 from boxplus.systems.slam.graph import MapGraph, add_loops, mean_up, open_graph
 
 Floats = NDArray[np.float64]
@@ -57,6 +58,7 @@ class Fit:
             beside it, where these scatter by far more than the places do, else 1.
         tension: mean square of the odometry's errors, in variances per direction; far below 1 where nothing bends it.
         datum_step: (3,) what the second datum is shifted by against the first, east, north, up [m]; zero where there is one.
+        shifts: to ask what a shift of fixes would explain, if their datum is one.
     """
 
     T_map: Floats
@@ -74,6 +76,7 @@ class Fit:
     height_scale: float
     tension: float
     datum_step: Floats
+    shifts: Shifts
 
     @property
     def gated(self) -> list[tuple[int, int]]:
@@ -202,6 +205,7 @@ def _result(
     errors = residual.evaluate(T_enu[datum], T_map[attached.map_of], lever, solution[delay][0])
     odometry = [group for group in problem.groups if group.name == "odometry"]
     tension = float(np.mean(odometry[0].squares(solution.values))) / 6.0 if odometry else 0.0
+    information = np.asarray(np.linalg.inv(fix_covariance) * used[:, None, None], dtype=np.float64)
     return Fit(
         T_map=T_map,
         T_enu_map=T_enu[0],
@@ -218,6 +222,7 @@ def _result(
         height_scale=scales[1],
         tension=tension,
         datum_step=T_enu[-1, 4:] - T_enu[0, 4:],
+        shifts=Shifts.of(solution, (x, world, arm, delay), attached, errors, information),
     )
 
 

@@ -22,6 +22,7 @@ from boxplus.systems.georeference.heights import climb_of
 from boxplus.systems.georeference.hypotheses import other_clock, other_readings
 from boxplus.systems.georeference.jump import jump_of
 from boxplus.systems.georeference.plateau import plateau_of
+from boxplus.systems.georeference.slide import Unshown, slide_of, unshown_of
 from boxplus.systems.georeference.start import Start, extent_of, find_start
 from boxplus.systems.slam.graph import MapGraph, mean_up
 
@@ -51,6 +52,7 @@ class Georeference:
         stretches: of fixes that fit nothing, (begin [s] since the first fix, duration [s], metres) each.
         warnings: what to doubt about it, one sentence each.
         contradiction: why it is not to be trusted, as the fixes contradict themselves; None where they do not.
+        unshown: how far fixes may slide or turn without a word.
     """
 
     refusal: str | None
@@ -61,6 +63,7 @@ class Georeference:
     stretches: list[tuple[float, float, float]]
     warnings: list[str]
     contradiction: str | None = None
+    unshown: Unshown | None = None
 
     @property
     def used(self) -> int:
@@ -201,6 +204,8 @@ def _judged(
     warnings = warnings + [text for text in doubts if text is not None]
     jump = jump_of(attached, found, lambda after: fit(graph, attached, p_enu, found.T_enu_map, used, lever, config, after))
     plateau = plateau_of(attached, found)
+    # Where fixes jump, a slide explains the same worse.
+    slide = slide_of(attached, found.shifts) if jump is None and plateau is None else None
     left_out = Counter(attached.left_out) + of_gated(attached, found)
     return Georeference(
         refusal=None,
@@ -209,8 +214,9 @@ def _judged(
         attached=attached,
         left_out=dict(left_out),
         stretches=stretches,
-        warnings=warnings + doubts_of(attached, found, lever is not None, stretches, jump, plateau, config),
+        warnings=warnings + doubts_of(attached, found, lever is not None, stretches, jump, plateau, slide, config),
         contradiction=contradiction_of(jump, plateau, found),
+        unshown=unshown_of(attached, found.shifts),
     )
 
 

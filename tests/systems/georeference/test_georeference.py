@@ -190,7 +190,9 @@ def test_fixes_that_are_off_by_the_same_for_long_contradict_the_others(
     assert plateau is not None and plateau.metres == pytest.approx(metres, abs=1.0) and 36.0 < plateau.duration < 41.0
     assert said is not None and re.search("fixes lie 1[12].. m off for [34]. s from 2. s on, all by the same and longer", said)
     stretches = gated_stretches(attached, gated)
-    assert not any("longer than multipath" in text for text in doubts_of(attached, gated, True, stretches, None, plateau, CONFIG))
+    assert not any(
+        "longer than multipath" in text for text in doubts_of(attached, gated, True, stretches, None, plateau, None, CONFIG)
+    )
 
     # In a long recording nearly all the others agree.
     time_ns = attached.time_ns.copy()
@@ -198,7 +200,7 @@ def test_fixes_that_are_off_by_the_same_for_long_contradict_the_others(
     long = replace(attached, time_ns=time_ns)
     plateau = plateau_of(long, gated)
     assert plateau is not None and contradiction_of(None, plateau, gated) is None
-    warnings = doubts_of(long, gated, True, gated_stretches(long, gated), None, plateau, CONFIG)
+    warnings = doubts_of(long, gated, True, gated_stretches(long, gated), None, plateau, None, CONFIG)
     assert [text for text in warnings if "longer than multipath" in text and text.endswith("which is not used")]
 
 
@@ -311,7 +313,7 @@ def test_an_antenna_elsewhere_is_named_where_speeds_do_not_tell_it_from_a_delay(
     assert fit is not None
 
     def said(attached: AttachedFixes) -> str:
-        (warning,) = [text for text in doubts_of(attached, fit, True, [], None, None, CONFIG) if "stamped" in text]
+        (warning,) = [text for text in doubts_of(attached, fit, True, [], None, None, None, CONFIG) if "stamped" in text]
         return warning
 
     assert "farther back than the lever arm says would look the same" in said(result.attached)  # driven at one speed
