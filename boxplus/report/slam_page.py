@@ -18,6 +18,7 @@ from boxplus.report.plots import plain
 from boxplus.report.skeleton import html_table, picture, tiles, warnings_section, write_html
 from boxplus.runs.slam.loop_file import why_refused
 from boxplus.runs.slam.result import SlamResult
+from boxplus.runs.slam.summary import GnssFacts
 from boxplus.sensors.geodesy import EnuFrame
 from boxplus.systems.slam.loop import Loop
 
@@ -135,9 +136,20 @@ def _earth(result: SlamResult) -> str:
     where = f"{facts.origin[0]:.7f}°, {facts.origin[1]:.7f}°, {facts.origin[2]:.2f} m above the ellipsoid of WGS84"
     text = (
         f"Origin {where}: look at the place on a map, an offset of the datum is seen nowhere else. {facts.used} fixes; "
-        f"heading known to {facts.heading_sigma_deg:.2f}°, places to {facts.position_sigma_m:.2f} m."
+        f"heading known to {facts.heading_sigma_deg:.2f}°, places to {facts.position_sigma_m:.2f} m. {_unshown(facts)}"
     )
     return f"<section><h2>On the Earth</h2><p>{text}</p>{picture(figure, 'fixes over the ground track')}{left_out}</section>"
+
+
+def _unshown(facts: GnssFacts) -> str:
+    """What these figures do not hold for."""
+    slide, turn = facts.unshown_slide_m, facts.unshown_turn_deg
+    slides = "slide by any distance" if slide is None else f"slide by up to {slide:.1f} m from begin to end"
+    turns = "be turned by any angle" if turn is None else f"be turned by up to {turn:.1f}° half way"
+    return (
+        f"That holds if errors of fixes last for no more than tens of seconds: they might {slides}, or {turns}, and the odometry, "
+        "which may drift as much, would not show it."
+    )
 
 
 def _table(result: SlamResult) -> str:
