@@ -147,8 +147,8 @@ def _unshown(facts: GnssFacts) -> str:
     slides = "slide by any distance" if slide is None else f"slide by up to {slide:.1f} m from begin to end"
     turns = "be turned by any angle" if turn is None else f"be turned by up to {turn:.1f}° half way"
     return (
-        f"That holds if errors of fixes last for no more than tens of seconds: they might {slides}, or {turns}, and the odometry, "
-        "which may drift as much, would not show it."
+        f"That holds if errors of fixes last for no more than tens of seconds: they might {slides}, or {turns}, and the "
+        "odometry, which may drift as much, would not show it."
     )
 
 
