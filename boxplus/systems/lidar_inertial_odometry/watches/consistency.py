@@ -304,12 +304,18 @@ def _extrinsic(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _lidar_twist(x_before: NDArray[np.float64], x: NDArray[np.float64], seconds: float) -> Twist:
-    """Mean turn rate and velocity of the LiDAR between two states (36,), in its frame."""
-    R_before, R_now, R_imu_lidar = (state[k : k + 9].reshape(3, 3) for state, k in ((x_before, R), (x, R), (x, RL)))
-    rate = R_imu_lidar.T @ so3.log(R_before.T @ R_now) / seconds
-    arm = x[PL : PL + 3]
-    moved = x[P : P + 3] + R_now @ arm - x_before[P : P + 3] - R_before @ arm
-    return rate, R_imu_lidar.T @ R_now.T @ moved / seconds
+    """Mean turn rate and velocity of the LiDAR between two states (36,), in its frame.
+
+    Each has its own mounting: where a scan moves that, it moves the IMU's pose the other way.
+    """
+    (R_before, p_before), (R_now, p_now) = (_lidar_pose(state) for state in (x_before, x))
+    return so3.log(R_before.T @ R_now) / seconds, R_now.T @ (p_now - p_before) / seconds
+
+
+def _lidar_pose(x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation (3, 3) and position (3,) of the LiDAR in the world."""
+    R_world_imu = x[R : R + 9].reshape(3, 3)
+    return R_world_imu @ x[RL : RL + 9].reshape(3, 3), x[P : P + 3] + R_world_imu @ x[PL : PL + 3]
 
 
 def _turn(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
