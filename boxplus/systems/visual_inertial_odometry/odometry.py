@@ -26,6 +26,7 @@ from boxplus.sensors.checked import checked_imu
 from boxplus.sensors.eight_bits import EightBits
 from boxplus.sensors.glitch_filter import GlitchFilter
 from boxplus.sensors.gyro_attitude import GyroAttitude
+from boxplus.sensors.image_instants import ImageInstants
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.imu_saturation import Limit, Saturation
 from boxplus.sensors.imu_values import measurements
@@ -57,7 +58,8 @@ class VisualInertialOdometry:
     """Estimates the pose of an IMU from its samples and the images of cameras rigidly attached to it.
 
     Push IMU samples and images in the order of time; each call returns the estimates that have become ready, one for each instant
-    at which images were taken (it waits for the images of all cameras, and for IMU samples up to it). Call `flush` at the end.
+    at which images were taken (it waits for the images of all cameras, and for IMU samples up to it). Stamps of one instant may
+    differ by a millisecond from camera to camera; it has that of the first one. Call `flush` at the end.
 
     Args:
         config: the settings; None for the defaults.
@@ -99,7 +101,7 @@ class VisualInertialOdometry:
             self._line_tracker = LineTracker(require("cv2", "which finds lines"), self.rig, self.config.max_lines)
         self._imu, self._glitches = ImuSamples.joined([]), GlitchFilter()
         self._newest_imu_ns = -(2**62)
-        self._images: dict[int, dict[int, NDArray[Any]]] = {}
+        self._images = ImageInstants(len(self.rig.cameras))
         self._search = StartSearch()
         self._repeated = RepeatedImages()
         self._time_ns = 0  # of the frame before
@@ -147,7 +149,7 @@ class VisualInertialOdometry:
         if image.time_ns <= self._time_ns:
             self._counters["images out of order"] += 1
             return []
-        self._images.setdefault(image.time_ns, {})[image.camera] = image.grey()
+        self._images.add(image)
         return self._advance(final=False)
 
     def flush(self) -> list[VioEstimate]:
@@ -192,12 +194,11 @@ class VisualInertialOdometry:
     def _advance(self, *, final: bool) -> list[VioEstimate]:
         """The frames that are complete, and covered by IMU samples."""
         estimates = []
-        for time_ns in sorted(self._images):
-            complete = len(self._images[time_ns]) == len(self.rig.cameras) or final or time_ns < max(self._images)
+        for time_ns in self._images.complete(final=final):
             until = time_ns + self.window.cut_ns + (SPARE_NS if self.config.time_offset_estimation and not final else 0)
-            if not complete or not len(self._imu) or self._imu.time_ns[-1] < until:
+            if not len(self._imu) or self._imu.time_ns[-1] < until:
                 break
-            images = self._images.pop(time_ns)
+            images = self._images.take(time_ns)
             if self._imu.time_ns[0] > time_ns:
                 self._counters["images before the first IMU sample"] += 1
                 continue

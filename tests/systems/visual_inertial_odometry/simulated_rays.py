@@ -181,15 +181,20 @@ def run(
     tracker: SimulatedTracker | None = None,
     silent: tuple[float, float] = (1e9, 1e9),
     line_tracker: LineFollower | None = None,
+    late_ns: int = 0,
 ) -> tuple[VisualInertialOdometry, list[VioEstimate]]:
-    """All of a flight through the odometry, but for the IMU samples between the two times `silent` [s]."""
+    """All of a flight through the odometry, but for the IMU samples between the two times `silent` [s].
+
+    Stamps of each camera are `late_ns` later than those of the camera before.
+    """
     vio = VisualInertialOdometry(config, its, tracker or SimulatedTracker(flight, its), line_tracker)
     blank = np.zeros((480, 752), np.uint8)
     estimates = []
     for k in range(0, len(flight.time_ns) - IMAGE_EVERY, IMAGE_EVERY):
         samples = np.array([n for n in range(k, k + IMAGE_EVERY) if not silent[0] <= n / RATE < silent[1]], dtype=np.int64)
         for camera in range(len(its.cameras)):
-            estimates += vio.push_image(CameraImage(camera, f"cam{camera}", int(flight.time_ns[k]), blank))
+            stamp_ns = int(flight.time_ns[k]) + camera * late_ns
+            estimates += vio.push_image(CameraImage(camera, f"cam{camera}", stamp_ns, blank))
         estimates += vio.push_imu(flight.time_ns[samples], flight.gyro[samples], flight.accel[samples])
     return vio, estimates + vio.flush()
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from boxplus.recordings.cameras.calibration import inverse
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence
+from boxplus.sensors.image_instants import TOGETHER_NS
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ def check_synchronisation(pair: list[CameraStream], times_ns: list[list[int]]) -
     text = f"{len(one)} and {len(two)} images; {alone} without a partner; stamps of a pair are {usual:.3f} ms apart in the median"
     if not partners.any():
         return Evidence(key, "none", "error", f"{text}: these cameras are not synchronised, their images are no stereo pairs")
-    if usual > 1.0 or alone > 0.1 * len(one):
+    if usual > 1e-6 * TOGETHER_NS or alone > 0.1 * len(one):
         return Evidence(key, f"{usual:.3f} ms", "warning", f"{text}: trigger both cameras together, or treat them as two")
     return Evidence(key, f"{usual:.3f} ms", "ok", text)
 
