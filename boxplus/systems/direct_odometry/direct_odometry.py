@@ -152,9 +152,10 @@ class DirectOdometry:
         stereo = self.stereo
         one, two = as_image(left), as_image(right)
 
-        def depth_of(*_: object) -> SensedDepth:
-            depth = stereo.depth(one, two, self.camera)
-            self._sensor.pair(one, two, depth, self.camera)
+        def depth_of(T_world_camera: Matrix, _: float) -> SensedDepth:
+            depth, unseen_s = stereo.depth(one, two, self.camera), self._unseen_s(time_ns)
+            motion = Motion.between(self._T, T_world_camera, unseen_s) if unseen_s > 0.0 else None
+            self._sensor.pair(one, two, depth, self.camera, motion)
             return depth
 
         return self._push(time_ns, one, depth_of)

@@ -67,10 +67,10 @@ class SensorWatch:
         self._surfaces: dict[int, Surfaces] = {}
         self._velocities: dict[int, Matrix] = {}
 
-    def pair(self, left: Image, right: Image, depth: SensedDepth, camera: Pinhole) -> None:
-        """Both images of a keyframe of a stereo pair, and the depths that were found in them."""
+    def pair(self, left: Image, right: Image, depth: SensedDepth, camera: Pinhole, motion: Motion | None) -> None:
+        """Both images of a keyframe of a stereo pair, and the depths that were found in them; motion: as in `frame`."""
         if self._pair is not None:
-            self._pair.add(left, right, depth, camera)
+            self._pair.add(left, right, depth, camera, None if motion is None else motion.at_once)
 
     def begin_alone(self, views: TwoViews) -> None:
         """The start of one camera alone: where a part of the view is carried along, all that stands still in it is."""

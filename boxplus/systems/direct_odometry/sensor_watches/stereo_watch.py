@@ -7,8 +7,9 @@ there,
 
 asks, beside its own inverse depth and an offset, for what moves pixels across these lines: another focal length of the second
 camera (∂π'/∂q = p' − c'), and turns of it about the baseline and about its axis (P' (axis × Y')). A turn in the plane of the two
-looks like other depths, and only a motion tells it (`calibration_causes.py`). As in `leftover.py` the covariance is that of the
-scatter between cells of the image, and frames are combined by their information.
+looks like other depths, and only a motion tells it (`calibration_causes.py`). Where the second image is taken later by q, its
+camera has moved on, P' (−ω × Y' − ρ v) by its velocity [ω, v]: a turn that goes with the motion. As in `leftover.py` the
+covariance is that of the scatter between cells of the image, and frames are combined by their information.
 
 Source: docs/direct_odometry.md, "What bad input shows as".
 """
@@ -35,12 +36,17 @@ _CUT = 3.0  # times the median of the patches' errors beyond which one shows som
 _CELLS = 6  # across and down
 _LEAST_PX, _LEAST_SIGMAS = 0.15, 6.0  # of a contradiction; what is off by more than a pixel is not found, and looks smaller
 _OWN_ERROR = 0.0005  # standard deviation of one frame that its scatter does not show
+_LEAST_LATE_S = 0.001
+_LEAST_FLOW_PX_S = 10.0  # of the image, for a frame to tell times
 _WHAT = (
     "a focal length of the second camera that is stated {:+.1f} % off or more",
     "a second camera that is turned by {:.2f} degrees or more about the baseline",
     "a second camera that is turned by {:.2f} degrees or more about its axis",
+    "a second image that is taken {:+.1f} ms or more after the first, whatever their stamps say",
 )
-_UNITS = np.array([-100.0, np.degrees(1.0), np.degrees(1.0)])
+_LATE = 3  # the cause that depends on the motion
+_UNITS = np.array([-100.0, np.degrees(1.0), np.degrees(1.0), 1000.0])
+_SIGNED = (0, _LATE)
 
 
 class StereoWatch:
@@ -53,11 +59,21 @@ class StereoWatch:
     def __init__(self, stereo: StereoPair) -> None:
         T = SE3Left.check("T_right_left", stereo.T_right_left)[0]
         self._camera, self._R, self._t = check_pinhole(stereo.camera, "direct odometry"), quaternion.to_matrix(T[:4]), T[4:]
-        self._found = Combined(3, _OWN_ERROR)
-        self._moved_px = np.zeros(3)  # by each cause [px], root mean square over the last frame
+        # Times are asked for beside the others, which are known better without: few frames hardly tell a turn from one that goes
+        # with the motion.
+        self._found, self._found_late = Combined(_LATE, _OWN_ERROR), Combined(len(_WHAT), _OWN_ERROR)
+        # By each cause [px], root mean square over the last frame; over the liveliest one where it depends on the motion.
+        self._moved_px = np.zeros(len(_WHAT))
 
-    def add(self, left: Image, right: Image, depth: SensedDepth, camera: Pinhole) -> None:
-        """A pair of images, with the depths that were found; camera: of the left one."""
+    def add(self, left: Image, right: Image, depth: SensedDepth, camera: Pinhole, velocity: Matrix | None = None) -> None:
+        """A pair of images.
+
+        Args:
+            left, right: grey values.
+            depth: that were found in them.
+            camera: of the left image.
+            velocity: (6,) [w, v] of the left camera, in itself [rad/s, m/s]; None where it is not known.
+        """
         v, u = np.nonzero(depth.z)
         height, width = left.shape
         inside = (u >= _BORDER) & (v >= _BORDER) & (u < width - _BORDER) & (v < height - _BORDER)
@@ -76,13 +92,30 @@ class StereoWatch:
             return
         e = value[good] - left.grey[pixels[good, :, 1], pixels[good, :, 0]]
         moved = self._moved(Y[good], there[good], P[good])
-        self._moved_px = np.sqrt(np.mean(np.sum(moved**2, axis=-1), axis=(0, 1)))
+        self._moved_px[:_LATE] = _root_mean_square(moved)
         by_depth = np.einsum("nki,nkij,j->nk", slope[good], P[good], self._t)
-        J = np.einsum("nki,nkqi->nkq", slope[good], moved)
         cell = (centre[good, 1] * _CELLS // height) * _CELLS + centre[good, 0] * _CELLS // width
+        J = np.einsum("nki,nkqi->nkq", slope[good], moved)
         found_q = _explained(e, by_depth, J, cell)
         if found_q is not None:
             self._found.add(*found_q)
+        if velocity is None:
+            return
+        flow = np.einsum("nkij,nkj->nki", P[good], self._passed(velocity, Y[good], rho[good]))[:, :, None]
+        flow_px_s = float(_root_mean_square(flow)[0])
+        if flow_px_s < _LEAST_FLOW_PX_S:
+            return
+        self._moved_px[_LATE] = max(self._moved_px[_LATE], flow_px_s)
+        found_q = _explained(e, by_depth, np.concatenate([J, np.einsum("nki,nkqi->nkq", slope[good], flow)], axis=2), cell)
+        if found_q is not None:
+            self._found_late.add(*found_q)
+
+    def _passed(self, velocity: Matrix, Y: Matrix, rho: Matrix) -> Matrix:
+        """(n, K, 3) what a second makes of Y (n, K, 3), by the velocity (6,) of the left camera."""
+        w, centre = velocity[:3], -self._R.T @ self._t  # of the right camera, in the left one
+        w_right, v_right = self._R @ w, self._R @ (velocity[3:] + np.cross(w, centre))
+        passed: Matrix = -np.cross(np.broadcast_to(w_right, Y.shape), Y) - rho[:, None, None] * v_right
+        return passed
 
     def _moved(self, Y: Matrix, there: Matrix, P: Matrix) -> Matrix:
         """(n, K, 3, 2) pixels by each cause."""
@@ -95,22 +128,33 @@ class StereoWatch:
     @property
     def contradiction(self) -> str:
         """What does not fit, in a sentence; empty where all does."""
-        if not self._moved_px.all():
+        if not self._moved_px[:_LATE].all():
             return ""
-        found = self._found.strongest(_LEAST_PX / self._moved_px, _LEAST_SIGMAS)
+        least = _LEAST_PX / np.maximum(self._moved_px, 1e-9)
+        least[_LATE] = max(least[_LATE], _LEAST_LATE_S)
+        with_time = self._found_late.strongest(least, _LEAST_SIGMAS)
+        is_late = with_time is not None and with_time[0] == _LATE
+        told_by = self._found_late if is_late else self._found
+        found = with_time if is_late else self._found.strongest(least[:_LATE], _LEAST_SIGMAS)
         if found is None:
             return ""
         k, q, sigma = found
-        what = _WHAT[k].format(_UNITS[k] * (q if k == 0 else abs(q)))
+        what = _WHAT[k].format(_UNITS[k] * (q if k in _SIGNED else abs(q)))
         return (
             "the stereo calibration does not fit these images: what both cameras see lies beside its epipolar lines, as with "
-            f"{what} ({abs(q) / sigma:.0f} standard deviations, over {self._found.frames} keyframes); "
-            "check the focal lengths and sizes of the images, which camera is which, and T_imu_camera"
+            f"{what} ({abs(q) / sigma:.0f} standard deviations, over {told_by.frames} keyframes); "
+            "check the focal lengths and sizes of the images, which camera is which, T_imu_camera, and the trigger of both"
         )
 
 
+def _root_mean_square(moved: Matrix) -> Matrix:
+    """(q,) lengths of (n, K, q, 2)."""
+    size: Matrix = np.sqrt(np.mean(np.sum(moved**2, axis=-1), axis=(0, 1)))
+    return size
+
+
 def _explained(e: Matrix, by_depth: Matrix, J: Matrix, cell: NDArray[np.int64]) -> tuple[Matrix, Matrix] | None:
-    """q (3,) and its covariance, of errors (n, K) of patches with offsets and depths of their own; None where nothing says it."""
+    """q and its covariance, of errors (n, K) of patches with offsets and depths of their own; None where nothing says it."""
     e, by_depth, J = (x - x.mean(axis=1, keepdims=True) for x in (e, by_depth, J))
     square = np.maximum((by_depth**2).sum(axis=1), 1e-12)
     e = e - by_depth * ((by_depth * e).sum(axis=1) / square)[:, None]
