@@ -141,9 +141,11 @@ def camera_model(
     try:
         if projection == "pinhole" and len(intrinsics) == 4:
             fx, fy, cx, cy = intrinsics
-            if distortion in ("radtan", "radial-tangential", "plumb_bob", "none", "None", ""):
+            if distortion in ("radtan", "radial-tangential", "plumb_bob", "rational_polynomial", "none", "None", ""):
                 if not any(coefficients):
                     return Pinhole(fx, fy, cx, cy), ""
+                if not any(coefficients[5:]):  # k4, k5, k6 of a rational polynomial, and what may follow
+                    coefficients = coefficients[:5]
                 if distortion not in ("none", "None", "") and len(coefficients) in (4, 5):
                     k1, k2, p1, p2 = coefficients[:4]
                     k3 = coefficients[4] if len(coefficients) == 5 and coefficients[4] else None
