@@ -35,6 +35,8 @@ _TURNS_ALIKE_RAD = 0.02
 _FEWEST_SCANS = 9
 _FIRST, _LAST = 6, 4  # scans of the first and of the last third
 _MOST_MAP_POINTS, _POINTS, _VOXEL_M = 5000, 1500, 0.4
+_RAYS, _BESIDE_RAD = 2000, np.deg2rad(5.0)  # of a scan that say where it looked, and how far beside them it did as well
+_COMPARED = 0.3
 _FEWEST_JUDGED = 60  # points on surfaces: with less of them nothing is explained
 
 
@@ -77,6 +79,9 @@ def explained_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[T
         more_off = (other_misfit - own_misfit) / config.plane_threshold**2
         elsewhere = not one_motion(part.poses, other, _ASTRAY_RAD, _ASTRAY_M + _ASTRAY_SHARE * _way(part.poses))
         if astray is None and elsewhere and float(part.weak.mean()) < _FEW_WEAK and more_off > _MORE_OFF:
+            own_misfit, other_misfit = (_misfit(chosen, poses, config, looked_at=True) for poses in (part.poses, other))
+            if not (other_misfit - own_misfit) / config.plane_threshold**2 > _MORE_OFF:
+                continue
             twists = [expected[number] for number in numbers]
             # Where all but a few things go along with the LiDAR, as on a highway, it is the path that has gone astray.
             if not explains_changes(chosen, turning_through(other[0], other[1], np.array([rate for rate, _ in twists])), twists):
@@ -150,22 +155,48 @@ def _way(motion: Poses) -> float:
     return float(np.linalg.norm(np.diff(motion[2], axis=0), axis=1).sum())
 
 
-def _misfit(scans: Sequence[Scan], poses: Poses, config: RegistrationConfig) -> float:
-    """Mean squared distance [m²] of points of the last scans from the surfaces of the first ones; far off counts in full."""
+def _misfit(scans: Sequence[Scan], poses: Poses, config: RegistrationConfig, *, looked_at: bool = False) -> float:
+    """Mean squared distance [m²] of points of the last scans from the surfaces of the first ones; far off counts in full.
+
+    Args:
+        looked_at: whether what is far off counts only where one of the first scans has looked: a narrow view that turns away sees
+            what none of them could, and a path that stays behind seems to explain it better. NaN where less than a part of the
+            points lie in such directions.
+    """
     third = len(scans) // 3
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     thin = VoxelFilter(config.map_cell, _MOST_MAP_POINTS)
+    views: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = []
     for k in np.unique(np.linspace(0, third - 1, _FIRST).astype(int)):
-        tree.insert(thin(_placed(scans[k], poses, k))[1].astype(np.float64), downsample=True)
-    squared, judged, far = 0.0, 0, 0
+        placed = _placed(scans[k], poses, k)
+        views.append((poses[2][k], placed))
+        tree.insert(thin(placed)[1].astype(np.float64), downsample=True)
+    squared, judged, far, compared, total = 0.0, 0, 0, 0, 0
     most = config.plane_threshold**2
     for k in np.unique(np.linspace(len(scans) - third, len(scans) - 1, _LAST).astype(int)):
         points = VoxelFilter(_VOXEL_M, _POINTS)(_placed(scans[k], poses, k))[0].astype(np.float64)
         near, surface, distance, _ = surface_distances(tree, points)
         squared += float(np.minimum(distance[surface] ** 2, most).sum())
         judged += int(surface.sum())
-        far += int((~near).sum())
+        off = int((_among(points[~near], views) if looked_at else ~near).sum())
+        far, compared, total = far + off, compared + off + int(near.sum()), total + len(points)
+    if looked_at and not compared > _COMPARED * total:
+        return np.nan
     return (squared + most * far) / (judged + far) if judged > _FEWEST_JUDGED else most
+
+
+def _among(points: NDArray[np.float64], views: list[tuple[NDArray[np.float64], NDArray[np.float32]]]) -> NDArray[np.bool_]:
+    """(N,) whether points (N, 3) lie in a direction in which a scan looked, given where from (3,) and its points (M, 3)."""
+    among = np.zeros(len(points), dtype=np.bool_)
+    for origin, seen in views:
+        rays = IkdTree(_directions(seen[:: max(len(seen) // _RAYS, 1)] - origin))
+        among |= np.isfinite(rays.nearest(_directions(points - origin), 1, max_distance=_BESIDE_RAD).distances[:, 0])
+    return among
+
+
+def _directions(offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+    directions: NDArray[np.float64] = offsets / np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)[:, None]
+    return directions
 
 
 def _placed(scan: Scan, poses: Poses, k: int) -> NDArray[np.float32]:

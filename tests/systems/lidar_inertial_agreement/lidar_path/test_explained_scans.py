@@ -10,7 +10,7 @@ import pytest
 
 from boxplus.manifolds import so3
 from boxplus.sensors.scan import Scan
-from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar
+from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation, SpinningLidar
 from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, gyro_guesses
@@ -73,6 +73,17 @@ def test_where_the_scene_does_not_show_the_path_no_estimate_is_astray() -> None:
     simulation, scans = crossing()
     path = replace(true_path(simulation, scans), weak=np.ones(len(scans), dtype=bool))
     assert explained_scans(path, scans, true_twists(simulation, scans, 0.5), CONFIG).astray is None
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_narrow_view_that_turns_away_does_not_speak_for_a_path_that_stays(seed: int) -> None:
+    """The last scans see what the first ones could not: laid upon these as if nothing had turned, more of them find surfaces."""
+    turn = manoeuvres.constant_turn(3.5, (1.0, 0.0, 1.5), 0.5, np.radians(40.0))
+    simulation = Simulation(Scenario("turn", worlds.room(seed=seed), turn, RosetteLidar(), ImuModel()), seed, 3.0)
+    scans = data(simulation)[0]
+    path, expected = true_path(simulation, scans), true_twists(simulation, scans)
+    explained = explained_scans(frozen(path), scans, expected, CONFIG)
+    assert explained.astray is None
 
 
 def test_of_a_path_forwards_and_one_backwards_the_better_one_is_taken() -> None:
