@@ -21,7 +21,7 @@ _LONG = 0.1  # of all fixes, a stretch of gated ones that is more than multipath
 _LASTING = 30.0  # [s]
 _SIGMAS = 3.0
 _LEAST_DELAY = 0.03
-NOISY = 1.1  # of sound drives next to all claim enough
+NOISY = 1.5
 _BENT = 4.0  # mean square of the odometry's errors, where 1 is what its covariance allows
 
 
