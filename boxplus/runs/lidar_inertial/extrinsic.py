@@ -17,6 +17,7 @@ from boxplus.runs.lidar_inertial.rehearsal import rehearse
 from boxplus.sensors.imu import ImuSamples
 from boxplus.sensors.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
+from boxplus.systems.lidar_inertial_agreement.finding import Cause, Finding
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions, judges_rotation
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned
 from boxplus.systems.lidar_inertial_agreement.translation import ARM
@@ -30,6 +31,9 @@ _CHECK = 6.0, 20.0
 _MOST_STRETCHES = 5  # that are looked at in vain
 # A narrow view that loses hold once leaves nothing of a stretch: pieces of it, as begin and end in shares of its length.
 _PIECES = (0.0, 0.5), (0.25, 0.75), (0.5, 1.0)
+_FEWEST_SCANS = 15  # of a piece
+_FAR_LESS = 0.3  # of what a mirror leaves unexplained, a mounting may leave
+_NO_MOUNTING: frozenset[Cause] = frozenset({"gyro_unit", "gyro_sign", "not_together"})  # then none explains any stretch
 _WIDE_DEG, _WIDE_M = 10.0, 0.3
 _LEVER_EXPLAINED = 0.8
 _LEVER_CAUTION, _LEVER_FLOOR_M = 2.0, 0.01
@@ -111,9 +115,9 @@ def choose_extrinsic(recording: Recording, config: LioConfig, *, should_stop: Ca
     known = _known_extrinsic(recording, config)
     should_stop = should_stop or (lambda: False)
     declared = None if known is None else known.T_imu_lidar
-    agreement = _compared(recording, config, declared, should_stop)
-    if agreement is not None:
-        found = contradictions(agreement, declared)
+    compared = _compared(recording, config, declared, should_stop)
+    if compared is not None:
+        agreement, found = compared
         for finding in found:
             if finding.cause == "gyro_unit":
                 raise InputError(
@@ -127,24 +131,37 @@ def choose_extrinsic(recording: Recording, config: LioConfig, *, should_stop: Ca
 
 def _compared(
     recording: Recording, config: LioConfig, declared: NDArray[np.float64] | None, should_stop: Callable[[], bool]
-) -> Agreement | None:
+) -> tuple[Agreement, list[Finding]] | None:
     """The sensors over the first stretch that turns; without a declared mounting over the first that shows all of its rotation.
 
-    Where none does it is the one that shows most of it, or the first one; None without scans and samples.
+    Where none does it is the one that shows most of it, or the first one. With it come what whole stretches contradict. None
+    without scans and samples.
     """
     if declared is not None:
         for stretch in _turning_stretches(recording, *_CHECK):
-            return compare_sensors(*stretch, config, T_declared=declared)
+            agreement = compare_sensors(*stretch, config, T_declared=declared)
+            return agreement, contradictions(agreement, declared)
         return None
     best: Agreement | None = None
+    found: list[Finding] = []
     for stretch in islice(_turning_stretches(recording, *_ESTIMATE), _MOST_STRETCHES):
-        found = [compare_sensors(*stretch, config, refine=True)]
-        if not np.isfinite(_open_rad(found[0])):
-            found += [compare_sensors(*piece, config, refine=True) for piece in _pieces_of(*stretch) if not should_stop()]
-        best = min(found if best is None else [best, *found], key=_open_rad)
-        if _open_rad(best) < np.radians(_WIDE_DEG) or should_stop():
+        whole = compare_sensors(*stretch, config, refine=True)
+        if not found and (best is None or np.isfinite(_open_rad(whole))):
+            found = contradictions(whole, None)
+        best = _better(best, whole)
+        if _open_rad(whole) == np.inf and not _NO_MOUNTING & {finding.cause for finding in found}:
+            for piece in _pieces_of(*stretch):
+                if should_stop():
+                    break
+                agreement = compare_sensors(*piece, config, refine=True)
+                best = _better(best, agreement) if _is_no_mirror(agreement) else best
+        if _open_rad(best) < np.radians(_WIDE_DEG) or _NO_MOUNTING & {finding.cause for finding in found} or should_stop():
             break
-    return best
+    return None if best is None else (best, found)
+
+
+def _better(best: Agreement | None, other: Agreement) -> Agreement:
+    return other if best is None or _open_rad(other) < _open_rad(best) else best
 
 
 def _open_rad(agreement: Agreement) -> float:
@@ -153,12 +170,18 @@ def _open_rad(agreement: Agreement) -> float:
     return np.inf if rotation is None or not judges_rotation(agreement) else float(rotation.rotation_std[0][-1])
 
 
+def _is_no_mirror(agreement: Agreement) -> bool:
+    """Whether a mounting explains the turns far better than a mirror: few seconds, about two axes, show no flipped sign."""
+    rotation = agreement.rotation
+    return rotation is not None and 1.0 - rotation.explained < _FAR_LESS * (1.0 - rotation.mirrored)
+
+
 def _pieces_of(scans: list[Scan], imu: ImuSamples) -> Iterator[tuple[list[Scan], ImuSamples]]:
     """Pieces of a stretch."""
     first_ns, length_ns = scans[0].end_ns, scans[-1].end_ns - scans[0].end_ns
     for begin, end in _PIECES:
         piece = [scan for scan in scans if begin * length_ns <= scan.end_ns - first_ns <= end * length_ns]
-        if piece:
+        if len(piece) >= _FEWEST_SCANS:
             inside = (imu.time_ns > piece[0].start_ns - _MARGIN_NS) & (imu.time_ns < piece[-1].end_ns + _MARGIN_NS)
             yield piece, imu.where(inside)
 

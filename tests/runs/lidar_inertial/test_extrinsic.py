@@ -21,6 +21,7 @@ from boxplus.runs.lidar_inertial.extrinsic import Extrinsic, choose_extrinsic
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.sensors.scan import Scan
 from boxplus.simulation import Simulation, SpinningLidar, make_scenario, simulate
+from boxplus.simulation.faults import Fault, flip_gyro
 from boxplus.simulation.live_recording import as_recording
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
@@ -31,8 +32,8 @@ ONCE = LioConfig(extrinsic_estimation="off")  # the comparison alone, without a 
 class _Covered:
     """A recording that nobody says the mounting of, whose scans show nothing but noise near by for some seconds."""
 
-    def __init__(self, simulation: Simulation, begin_s: float, end_s: float) -> None:
-        self._recording = as_recording(simulation)
+    def __init__(self, simulation: Simulation, begin_s: float, end_s: float, fault: Fault | None = None) -> None:
+        self._recording = as_recording(simulation, fault)
         self._recording.info.T_imu_lidar = None
         self.info: RecordingInfo = self._recording.info
         self._span_ns = simulation.start_ns + np.array([begin_s, end_s]) * 1e9
@@ -61,6 +62,14 @@ def test_a_view_that_is_lost_for_a_second_leaves_the_rest_of_the_stretch(seed: i
     found = choose_extrinsic(cast(Recording, _Covered(walk, 4.0, 5.0)), ONCE)
     assert found.source == "estimated" and not found.unknown and found.sigma is not None
     assert _off_deg(found, walk) < 3.0 * found.sigma[0] < 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_piece_does_not_take_a_flipped_gyroscope_for_a_mounting(seed: int) -> None:
+    walk = simulate(make_scenario("walk_livox", seed=seed), duration_s=14.0)
+    found = choose_extrinsic(cast(Recording, _Covered(walk, 4.0, 5.0, flip_gyro())), ONCE)
+    assert found.source == "identity" and found.unknown
 
 
 @pytest.mark.slow
