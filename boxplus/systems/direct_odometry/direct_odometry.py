@@ -149,8 +149,7 @@ class DirectOdometry:
         """
         if self.stereo is None:
             raise InputError("the second camera", "none", "give it as DirectOdometry(camera, stereo=StereoPair(…))")
-        stereo = self.stereo
-        one, two = as_image(left), as_image(right)
+        stereo, one, two = self.stereo, as_image(left), as_image(right)
 
         def depth_of(T_world_camera: Matrix, _: float) -> SensedDepth:
             depth, unseen_s = stereo.depth(one, two, self.camera), self._unseen_s(time_ns)

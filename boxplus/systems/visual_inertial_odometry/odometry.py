@@ -57,9 +57,8 @@ _GIVEN = ("config", "rig", "window", "_tracker", "_line_tracker")
 class VisualInertialOdometry:
     """Estimates the pose of an IMU from its samples and the images of cameras rigidly attached to it.
 
-    Push IMU samples and images in the order of time; each call returns the estimates that have become ready, one for each instant
-    at which images were taken (it waits for the images of all cameras, and for IMU samples up to it). Stamps of one instant may
-    differ by a millisecond from camera to camera; it has that of the first one. Call `flush` at the end.
+    Push IMU samples and images in the order of time; each call returns the estimates that are ready, one for each instant of
+    images, with the stamp of the first, up to 1 ms apart (it waits for those of all cameras, and for IMU samples). `flush` ends it.
 
     Args:
         config: the settings; None for the defaults.
