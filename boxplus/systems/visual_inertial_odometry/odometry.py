@@ -58,7 +58,7 @@ class VisualInertialOdometry:
     """Estimates the pose of an IMU from its samples and the images of cameras rigidly attached to it.
 
     Push IMU samples and images in the order of time; each call returns the estimates that are ready, one for each instant of
-    images, with the stamp of the first, up to 1 ms apart (it waits for those of all cameras, and for IMU samples). `flush` ends it.
+    images, with the stamp of the first, up to 1 ms apart (it waits for those of all cameras, and for samples). `flush` ends it.
 
     Args:
         config: the settings; None for the defaults.
