@@ -202,7 +202,9 @@ def _result(
 ) -> Fit:
     world, arm, delay = others
     T_map, T_enu, lever = solution[x], solution[world], solution[arm][0]
-    errors = residual.evaluate(T_enu[datum], T_map[attached.map_of], lever, solution[delay][0])
+    fixes = residual.linearize(T_enu[datum], T_map[attached.map_of], lever, solution[delay][0])
+    of_world, of_map, of_arm, of_delay = fixes.jacobians
+    one = np.zeros(len(attached), dtype=np.intp)
     odometry = [group for group in problem.groups if group.name == "odometry"]
     tension = float(np.mean(odometry[0].squares(solution.values))) / 6.0 if odometry else 0.0
     information = np.asarray(np.linalg.inv(fix_covariance) * used[:, None, None], dtype=np.float64)
@@ -216,13 +218,21 @@ def _result(
         delay=float(solution[delay][0, 0]),
         delay_sigma=float(solution.standard_deviations(delay)[0, 0]),
         is_used=used,
-        errors=errors,
+        errors=fixes.residuals,
         fix_covariance=fix_covariance,
         noise_scale=scales[0],
         height_scale=scales[1],
         tension=tension,
         datum_step=T_enu[-1, 4:] - T_enu[0, 4:],
-        shifts=Shifts.of(solution, (x, world, arm, delay), attached, errors, information),
+        shifts=Shifts(
+            p_enu=residual.p_enu + fixes.residuals,
+            errors=fixes.residuals,
+            information=information,
+            solution=solution,
+            blocks=(x, world, arm, delay),
+            jacobians=(of_map, of_world, of_arm, of_delay),
+            rows=(attached.map_of, datum, one, one),
+        ),
     )
 
 

@@ -6,7 +6,7 @@ delay), d is eliminated from the other side:
 
     A = Sᵀ W S − Bᵀ H⁻¹ B,   B = Jᵀ W S,   d = −A⁻¹ Sᵀ W e,   cov d = A⁻¹,   the cost falls by dᵀ A d,
 
-so that what the odometry may have drifted, by its covariance, is no shift of the fixes. J are the derivatives in
+so that what the odometry may have drifted, by its covariance, is no shift of the fixes. J are the derivatives of
 `boxplus/residuals/antenna_position.py`.
 """
 
@@ -17,10 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.manifolds import quaternion, so3
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.terms.variables import Variables
-from boxplus.systems.georeference.attachment import AttachedFixes
 
 Floats = NDArray[np.float64]
 
@@ -43,7 +41,7 @@ class Shifts:
     Attributes:
         p_enu: (N, 3) where the antenna is by the fit [m]. errors: (N, 3) predicted less measured [m].
         information: (N, 3, 3) as the fixes were believed, zero where they are not used.
-        blocks: T_map, T_enu_map, lever arm and delay; jacobians: (N, 3, dof) of each, rows: (N,) which of it.
+        blocks: of the problem, in its order; jacobians: (N, 3, dof) of the errors by each, rows: (N,) which of it.
     """
 
     p_enu: Floats
@@ -53,32 +51,6 @@ class Shifts:
     blocks: tuple[Variables, ...]
     jacobians: tuple[Floats, ...]
     rows: tuple[NDArray[np.intp], ...]
-
-    @staticmethod
-    def of(
-        solution: Solution, blocks: tuple[Variables, ...], attached: AttachedFixes, errors: Floats, information: Floats
-    ) -> Shifts:
-        """Of a fit with one datum; blocks as in the attributes."""
-        T_map, T_enu, lever, delay = (solution[block] for block in blocks)
-        R1, R2 = quaternion.to_matrix(T_enu[0, :4]), quaternion.to_matrix(T_map[attached.map_of, :4])
-        R_imu = quaternion.to_matrix(attached.T_map_imu[:, :4])
-        a = attached.T_map_imu[:, 4:] + R_imu @ lever[0] - attached.v_map * delay[0, 0]
-        q, R12 = np.einsum("nab,nb->na", R2, a) + T_map[attached.map_of, 4:], R1 @ R2
-        every = np.zeros(len(attached), dtype=np.intp)
-        return Shifts(
-            p_enu=q @ R1.T + T_enu[0, 4:],
-            errors=errors,
-            information=information,
-            solution=solution,
-            blocks=blocks,
-            jacobians=(
-                np.concatenate([-R12 @ so3.hat(a), R12], axis=2),
-                np.concatenate([-R1 @ so3.hat(q), np.broadcast_to(R1, R12.shape)], axis=2),
-                R12 @ R_imu,
-                -np.einsum("nab,nb->na", R12, attached.v_map)[:, :, None],
-            ),
-            rows=(attached.map_of, every, every, every),
-        )
 
     def along(self, shape: Floats) -> Shift | None:
         """The shift along a shape (N, 2, m) on the ground; None where nothing tells it.
