@@ -74,13 +74,12 @@ def explained_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[T
         if len(chosen) < _FEWEST_SCANS or one_motion(part.poses, other):
             continue
         turns_alike = turns_alike and _apart(part.poses, other)[0] < _TURNS_ALIKE_RAD
-        own_misfit, other_misfit = _misfit(chosen, part.poses, config), _misfit(chosen, other, config)
-        by_path = by_path and own_misfit <= _WORSE * other_misfit
-        more_off = (other_misfit - own_misfit) / config.plane_threshold**2
+        laid, laid_other = _laid(chosen, part.poses, config), _laid(chosen, other, config)
+        by_path = by_path and laid.misfit <= _WORSE * laid_other.misfit
+        more_off = (laid_other.misfit - laid.misfit) / config.plane_threshold**2
         elsewhere = not one_motion(part.poses, other, _ASTRAY_RAD, _ASTRAY_M + _ASTRAY_SHARE * _way(part.poses))
         if astray is None and elsewhere and float(part.weak.mean()) < _FEW_WEAK and more_off > _MORE_OFF:
-            own_misfit, other_misfit = (_misfit(chosen, poses, config, looked_at=True) for poses in (part.poses, other))
-            if not (other_misfit - own_misfit) / config.plane_threshold**2 > _MORE_OFF:
+            if not (laid_other.misfit_in_view - laid.misfit_in_view) / config.plane_threshold**2 > _MORE_OFF:
                 continue
             twists = [expected[number] for number in numbers]
             # Where all but a few things go along with the LiDAR, as on a highway, it is the path that has gone astray.
@@ -112,7 +111,7 @@ def other_explains_better(scans: Sequence[Scan], own: Poses, other: Poses, confi
     """Whether other poses (K,) of the same scans explain them clearly better."""
     if len(scans) < _FEWEST_SCANS:
         return False
-    return _misfit(scans, own, config) > _WORSE * _misfit(scans, other, config)
+    return _laid(scans, own, config).misfit > _WORSE * _laid(scans, other, config).misfit
 
 
 def _reckoned(scans: Sequence[Scan], expected: Sequence[Twist]) -> Poses:
@@ -155,43 +154,71 @@ def _way(motion: Poses) -> float:
     return float(np.linalg.norm(np.diff(motion[2], axis=0), axis=1).sum())
 
 
-def _misfit(scans: Sequence[Scan], poses: Poses, config: RegistrationConfig, *, looked_at: bool = False) -> float:
-    """Mean squared distance [m²] of points of the last scans from the surfaces of the first ones; far off counts in full.
+@dataclass(frozen=True, slots=True)
+class _Laid:
+    """The last scans laid upon the first ones.
 
-    Args:
-        looked_at: whether what is far off counts only where one of the first scans has looked: a narrow view that turns away sees
-            what none of them could, and a path that stays behind seems to explain it better. NaN where less than a part of the
-            points lie in such directions.
+    Attributes:
+        squared: distances of points from surfaces of the first scans [m²], the sum; judged: how many points have one.
+        off: (F, 3) points that lie off everything; total: how many points were laid.
+        views: where from (3,) the first scans were taken, and some of their points (M, 3).
+        most: what a point that is off counts [m²].
     """
+
+    squared: float
+    judged: int
+    off: NDArray[np.float64]
+    total: int
+    views: list[tuple[NDArray[np.float64], NDArray[np.float32]]]
+    most: float
+
+    @property
+    def misfit(self) -> float:
+        """Mean squared distance of points from surfaces [m²]; what is off counts in full."""
+        return self._mean(len(self.off))
+
+    @property
+    def misfit_in_view(self) -> float:
+        """The same where what is off counts only in directions in which one of the first scans has looked.
+
+        A narrow view that turns away sees what none of them could, and a path that stays behind seems to explain it better. NaN
+        where less than a part of the points lie in such directions.
+        """
+        seen = int(self._is_in_view().sum())
+        return self._mean(seen) if self.total - len(self.off) + seen > _COMPARED * self.total else np.nan
+
+    def _mean(self, off: int) -> float:
+        if not self.judged > _FEWEST_JUDGED:
+            return self.most
+        return (self.squared + self.most * off) / (self.judged + off)
+
+    def _is_in_view(self) -> NDArray[np.bool_]:
+        seen = np.zeros(len(self.off), dtype=np.bool_)
+        for origin, points in self.views:
+            rays = IkdTree(_directions(points - origin))
+            seen |= np.isfinite(rays.nearest(_directions(self.off - origin), 1, max_distance=_BESIDE_RAD).distances[:, 0])
+        return seen
+
+
+def _laid(scans: Sequence[Scan], poses: Poses, config: RegistrationConfig) -> _Laid:
+    """Lay the last third of some scans upon the first, by poses (K,) of them."""
     third = len(scans) // 3
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     thin = VoxelFilter(config.map_cell, _MOST_MAP_POINTS)
-    views: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = []
+    views = []
     for k in np.unique(np.linspace(0, third - 1, _FIRST).astype(int)):
         placed = _placed(scans[k], poses, k)
-        views.append((poses[2][k], placed))
+        views.append((poses[2][k], placed[:: max(len(placed) // _RAYS, 1)]))
         tree.insert(thin(placed)[1].astype(np.float64), downsample=True)
-    squared, judged, far, compared, total = 0.0, 0, 0, 0, 0
+    squared, judged, total, off = 0.0, 0, 0, []
     most = config.plane_threshold**2
     for k in np.unique(np.linspace(len(scans) - third, len(scans) - 1, _LAST).astype(int)):
         points = VoxelFilter(_VOXEL_M, _POINTS)(_placed(scans[k], poses, k))[0].astype(np.float64)
         near, surface, distance, _ = surface_distances(tree, points)
         squared += float(np.minimum(distance[surface] ** 2, most).sum())
-        judged += int(surface.sum())
-        off = int((_among(points[~near], views) if looked_at else ~near).sum())
-        far, compared, total = far + off, compared + off + int(near.sum()), total + len(points)
-    if looked_at and not compared > _COMPARED * total:
-        return np.nan
-    return (squared + most * far) / (judged + far) if judged > _FEWEST_JUDGED else most
-
-
-def _among(points: NDArray[np.float64], views: list[tuple[NDArray[np.float64], NDArray[np.float32]]]) -> NDArray[np.bool_]:
-    """(N,) whether points (N, 3) lie in a direction in which a scan looked, given where from (3,) and its points (M, 3)."""
-    among = np.zeros(len(points), dtype=np.bool_)
-    for origin, seen in views:
-        rays = IkdTree(_directions(seen[:: max(len(seen) // _RAYS, 1)] - origin))
-        among |= np.isfinite(rays.nearest(_directions(points - origin), 1, max_distance=_BESIDE_RAD).distances[:, 0])
-    return among
+        judged, total = judged + int(surface.sum()), total + len(points)
+        off.append(points[~near])
+    return _Laid(squared, judged, np.concatenate(off), total, views, most)
 
 
 def _directions(offsets: NDArray[np.float64]) -> NDArray[np.float64]:
