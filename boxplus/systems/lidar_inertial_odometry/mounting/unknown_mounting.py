@@ -60,8 +60,8 @@ class UnknownMounting:
 
     def _moved_since(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """(6,) how the pose at x (36,) would move if the path began, with the present mounting, where it was said to begin."""
-        first, T_first = _pose(self._first), _mounted(self._first)
-        T_now, mounted = _pose(x), _mounted(x)
+        first, T_first = T_world_imu_of(self._first), T_imu_lidar_of(self._first)
+        T_now, mounted = T_world_imu_of(x), T_imu_lidar_of(x)
         moved = first @ mounted @ np.linalg.inv(first @ T_first) @ T_now
         return np.concatenate([so3.log(T_now[:3, :3].T @ moved[:3, :3]), moved[:3, 3] - T_now[:3, 3]])
 
@@ -92,14 +92,14 @@ class HeldMounting:
         return self._measurement.has_moved(x)
 
 
-def _pose(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def T_world_imu_of(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4) T_world_imu of a state (36,)."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = x[R : R + 9].reshape(3, 3), x[P : P + 3]
     return T
 
 
-def _mounted(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def T_imu_lidar_of(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4) T_imu_lidar of a state (36,)."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = x[RL : RL + 9].reshape(3, 3), x[PL : PL + 3]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.nav_state import BA, BW, PL, RL, T_BA, T_BW, T_THETA_L, TANGENT, P, R, V, boxminus_into
+from boxplus.filtering.nav_state import BA, BW, T_BA, T_BW, T_THETA_L, TANGENT, R, V, boxminus_into
 from boxplus.manifolds import so3
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
@@ -21,6 +21,7 @@ from boxplus.systems.lidar_inertial_agreement.shown import Shown
 from boxplus.systems.lidar_inertial_agreement.watch import Watch
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.mounted_update import MountedUpdate
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import T_imu_lidar_of, T_world_imu_of
 from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem
 from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
 from boxplus.systems.lidar_inertial_odometry.watches.steady_bias import SteadyBias
@@ -150,7 +151,7 @@ class Consistency:
         news = self._watch.add(
             frame.scan,
             frame.imu,
-            _extrinsic(x),
+            T_imu_lidar_of(x),
             _lidar_twist(x_before, x, frame.duration_s),
             suspicious=suspicious,
             blind=frame.largest_gap_s > self._max_imu_gap,
@@ -296,26 +297,14 @@ def _surely_above(bias: NDArray[np.float64], P: NDArray[np.float64], most: float
     return size - 3.0 * float(np.sqrt(axis @ P @ axis)) > most
 
 
-def _extrinsic(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    T = np.eye(4)
-    T[:3, :3] = x[RL : RL + 9].reshape(3, 3)
-    T[:3, 3] = x[PL : PL + 3]
-    return T
-
-
 def _lidar_twist(x_before: NDArray[np.float64], x: NDArray[np.float64], seconds: float) -> Twist:
     """Mean turn rate and velocity of the LiDAR between two states (36,), in its frame.
 
     Each has its own mounting: where a scan moves that, it moves the IMU's pose the other way.
     """
-    (R_before, p_before), (R_now, p_now) = (_lidar_pose(state) for state in (x_before, x))
-    return so3.log(R_before.T @ R_now) / seconds, R_now.T @ (p_now - p_before) / seconds
-
-
-def _lidar_pose(x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (3, 3) and position (3,) of the LiDAR in the world."""
-    R_world_imu = x[R : R + 9].reshape(3, 3)
-    return R_world_imu @ x[RL : RL + 9].reshape(3, 3), x[P : P + 3] + R_world_imu @ x[PL : PL + 3]
+    before, now = (T_world_imu_of(state) @ T_imu_lidar_of(state) for state in (x_before, x))
+    R_now = now[:3, :3]
+    return so3.log(before[:3, :3].T @ R_now) / seconds, R_now.T @ (now[:3, 3] - before[:3, 3]) / seconds
 
 
 def _turn(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
