@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import islice
+from functools import reduce
+from itertools import islice, takewhile
 from typing import Literal
 
 import numpy as np
@@ -149,13 +150,12 @@ def _compared(
         if not found and (best is None or np.isfinite(_open_rad(whole))):
             found = contradictions(whole, None)
         best = _better(best, whole)
-        if _open_rad(whole) == np.inf and not _NO_MOUNTING & {finding.cause for finding in found}:
-            for piece in _pieces_of(*stretch):
-                if should_stop():
-                    break
-                agreement = compare_sensors(*piece, config, refine=True)
-                best = _better(best, agreement) if _is_no_mirror(agreement) else best
-        if _open_rad(best) < np.radians(_WIDE_DEG) or _NO_MOUNTING & {finding.cause for finding in found} or should_stop():
+        is_vain = any(finding.cause in _NO_MOUNTING for finding in found)
+        if not is_vain and not np.isfinite(_open_rad(whole)):
+            pieces = takewhile(lambda _: not should_stop(), _pieces_of(*stretch))
+            agreements = (compare_sensors(*piece, config, refine=True) for piece in pieces)
+            best = reduce(_better, filter(_is_no_mirror, agreements), best)
+        if is_vain or _open_rad(best) < np.radians(_WIDE_DEG) or should_stop():
             break
     return None if best is None else (best, found)
 
