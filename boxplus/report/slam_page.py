@@ -142,7 +142,9 @@ def _earth(result: SlamResult) -> str:
 
 
 def _unshown(facts: GnssFacts) -> str:
-    """What these figures do not hold for."""
+    """What these figures do not hold for; nothing where the run, of an older version, did not ask."""
+    if "unshown_slide_m" not in facts.model_fields_set:
+        return ""
     slide, turn = facts.unshown_slide_m, facts.unshown_turn_deg
     slides = "slide by any distance" if slide is None else f"slide by up to {slide:.1f} m from begin to end"
     turns = "be turned by any angle" if turn is None else f"be turned by up to {turn:.1f}° half way"

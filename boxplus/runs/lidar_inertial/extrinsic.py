@@ -105,7 +105,7 @@ def choose_extrinsic(recording: Recording, config: LioConfig, *, should_stop: Ca
     Args:
         recording: opened.
         config: of the odometry.
-        should_stop: asked during that first run; True ends it, and the estimate stays as it was.
+        should_stop: asked between events, comparisons, and in that first run; True ends them, and what is known by then stands.
 
     Raises:
         RecordingError: nothing at all could be read.
@@ -138,14 +138,15 @@ def _compared(
     Where none does it is the one that shows most of it, or the first one. With it come what whole stretches contradict. None
     without scans and samples.
     """
+    events = takewhile(lambda _: not should_stop(), recording)
     if declared is not None:
-        for stretch in _turning_stretches(recording, *_CHECK):
+        for stretch in _turning_stretches(events, *_CHECK):
             agreement = compare_sensors(*stretch, config, T_declared=declared)
             return agreement, contradictions(agreement, declared)
         return None
     best: Agreement | None = None
     found: list[Finding] = []
-    for stretch in islice(_turning_stretches(recording, *_ESTIMATE), _MOST_STRETCHES):
+    for stretch in islice(_turning_stretches(events, *_ESTIMATE), _MOST_STRETCHES):
         whole = compare_sensors(*stretch, config, refine=True)
         if not found and (best is None or np.isfinite(_open_rad(whole))):
             found = contradictions(whole, None)

@@ -82,6 +82,20 @@ def test_a_first_stretch_that_shows_nothing_is_not_the_last_word() -> None:
     assert _off_deg(found, flight) < 3.0 * found.sigma[0] < 2.0
 
 
+def test_the_search_ends_when_it_is_asked_to() -> None:
+    walk = as_recording(simulate("walk", duration_s=3.0))
+    walk.info.T_imu_lidar = None
+    taken = 0
+
+    def should_stop() -> bool:
+        nonlocal taken
+        taken += 1
+        return taken > 20
+
+    choose_extrinsic(walk, ONCE, should_stop=should_stop)
+    assert 20 < taken < 30
+
+
 @pytest.mark.slow
 def test_a_narrow_view_of_a_wall_without_a_mounting_is_followed_to_centimetres(shared_data: Path, tmp_path: Path) -> None:
     """The LiDAR looks 106 degrees away from where the identity has it; where nothing was found, the path was off by 47 cm."""

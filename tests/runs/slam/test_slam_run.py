@@ -33,6 +33,7 @@ from boxplus.runs.slam.loop_file import pairs_without_maps, read_loop_decisions
 from boxplus.runs.slam.result import SlamResult, load_slam_result
 from boxplus.runs.slam.slam_run import doubt_of_odometry, run_slam
 from boxplus.runs.slam.spool import ScanSpool, SpooledScan, read_spool
+from boxplus.runs.slam.summary import GnssFacts
 from boxplus.sensors.geodesy import EnuFrame, to_utm
 from boxplus.simulation import SpinningLidar
 from boxplus.simulation.gnss import GnssConfig
@@ -113,6 +114,17 @@ def test_the_head_of_the_report_says_what_is_not_to_be_trusted(finished: Finishe
     page = write_slam_report(replace(finished.result, folder=copy, summary=summary)).read_text(encoding="utf-8")
     assert '<span class="state failed">finished</span> not to be trusted · loops closed' in page
     assert "fixes jump by 3.0 m" in page and summary.describe_state().endswith("fixes jump by 3.0 m")
+
+
+def test_the_report_does_not_say_what_an_older_version_did_not_ask(finished: Finished, tmp_path: Path) -> None:
+    gnss, copy = finished.result.summary.gnss, SlamFolder(tmp_path)
+    assert gnss is not None
+    shutil.copy(finished.folder.gnss, copy.gnss)
+    older = GnssFacts.model_validate(gnss.model_dump(exclude={"unshown_slide_m", "unshown_turn_deg"}))
+    for facts, is_told in ((gnss, True), (older, False)):
+        summary = finished.result.summary.model_copy(update={"gnss": facts})
+        page = write_slam_report(replace(finished.result, folder=copy, summary=summary)).read_text(encoding="utf-8")
+        assert ("they might slide" in page) is is_told
 
 
 def test_the_report_repeats_the_warnings_of_the_odometry(finished: Finished, tmp_path: Path) -> None:
