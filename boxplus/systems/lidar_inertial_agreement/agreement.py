@@ -37,7 +37,7 @@ from boxplus.systems.lidar_inertial_agreement.translation import SLOPE, Translat
 
 _EXPLAINED = 0.8  # of the LiDAR's rotation, before the gyroscope may help to undistort
 _HALF_EXPLAINED = 0.5
-_TURNING_RAD_S = np.deg2rad(4.0)  # rms of one sensor that the other should show
+_STRONG_RAD_S = np.deg2rad(4.0)  # rms of one sensor that the other should show
 _OFFSET_KNOWN_S = 0.01
 _WILD_RAD_S = 4.0
 _SLOPE_DOUBTFUL = 0.03
@@ -48,6 +48,9 @@ _THICK_M = 0.08  # median misfit of a path: of sound ones the foliage of a fores
 ROTATION_KNOWN_RAD = 0.05
 LAG_RAD = float(np.deg2rad(2.5))
 """By how much a right mounting may seem turned because registrations lag, however many scans there are."""
+
+TURNING_RAD_S = float(np.deg2rad(1.0))
+"""Root mean square of the turn rate about its mean, below which rotations say nothing about unit, sign and mounting."""
 
 _COARSELY_RAD = 0.2
 _DECLARED_ARM_STD = 0.02  # m
@@ -233,7 +236,7 @@ def _doubtful(found: Agreement, T_declared: NDArray[np.float64] | None) -> bool:
     if rotation.explained < _EXPLAINED:
         unit = max(unit_of(rotation.scale), 1.0)
         strong = max(float(np.linalg.norm(rotation.excitation)), float(np.sqrt(found.gyro_power)) / unit)
-        return strong > float(_TURNING_RAD_S)
+        return strong > float(_STRONG_RAD_S)
     return T_declared is not None and contradicted_within(rotation, T_declared[:3, :3]) is not None
 
 
@@ -309,12 +312,20 @@ def apart_allowed(fit: RotationFit, known_rad: float = ROTATION_KNOWN_RAD, devia
     return LAG_RAD + deviations * float(np.linalg.norm(std[std < known_rad]))
 
 
+def shows_turns(fit: RotationFit) -> bool:
+    """Whether the turns are more than what is left of them unexplained, and more than errors of registrations look like."""
+    return float(np.linalg.norm(fit.excitation)) > max(TURNING_RAD_S, 2.0 * fit.sigma)
+
+
 def contradicted_within(fit: RotationFit, R_imu_lidar: NDArray[np.float64]) -> float | None:
     """Whether the mounting is another one: how well the axes are known that show it [rad]; None where it may be right.
 
     By the axes known to three degrees, or by those known to eleven: where all of them are known coarsely, a LiDAR that is turned
-    by a quarter is turned by many standard deviations still.
+    by a quarter is turned by many standard deviations still. Where hardly anything turns but at a constant rate, which a bias
+    takes up, none is contradicted: what lasers out of line make of a LiDAR's turns fits some mounting as well.
     """
+    if not shows_turns(fit):
+        return None
     for known_rad, deviations in ((ROTATION_KNOWN_RAD, 3.0), (_COARSELY_RAD, 5.0)):
         if apart(fit, R_imu_lidar, known_rad)[0] > apart_allowed(fit, known_rad, deviations):
             return known_rad

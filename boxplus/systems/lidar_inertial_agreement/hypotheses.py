@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from boxplus.systems.lidar_inertial_agreement.agreement import (
     ROTATION_KNOWN_RAD,
+    TURNING_RAD_S,
     Agreement,
     apart,
     apart_allowed,
     contradicted_within,
+    shows_turns,
     unit_of,
 )
 from boxplus.systems.lidar_inertial_agreement.finding import Cause, Finding
@@ -31,7 +33,6 @@ from boxplus.systems.lidar_inertial_agreement.translation import TURN, Translati
 
 _LEAST_SEEN = 0.5  # of the pairs of scans, all three rotations
 _GOOD_PATH_M = 0.15  # median misfit of registrations that can be believed
-_TURNING_RAD_S = np.deg2rad(1.0)  # rms below which rotations say nothing about unit and sign
 _BELONGING_RAD_S = np.deg2rad(8.0)  # rms of one sensor that the other must show
 _TOGETHER = 0.5
 _FITS = 0.8
@@ -101,12 +102,12 @@ def judges_rotation(agreement: Agreement) -> bool:
     rotation = agreement.rotation
     if rotation is None or not _path_counts(agreement) or rotation.explained < _FITS:
         return False
-    return _turning(rotation) and bool((rotation.rotation_std[0] < ROTATION_KNOWN_RAD).sum() >= 2)
+    return shows_turns(rotation) and bool((rotation.rotation_std[0] < ROTATION_KNOWN_RAD).sum() >= 2)
 
 
 def judges_clocks(rotation: RotationFit) -> bool:
     """Whether the motion shows the offset of the clocks."""
-    return _turning(rotation) and rotation.explained > _CLOSELY and rotation.knows_offset
+    return shows_turns(rotation) and rotation.explained > _CLOSELY and rotation.knows_offset
 
 
 def least_offset(rotation: RotationFit, imu_rate_hz: float) -> float:
@@ -116,7 +117,7 @@ def least_offset(rotation: RotationFit, imu_rate_hz: float) -> float:
 
 def judges_scale(rotation: RotationFit) -> bool:
     """Whether the motion shows the gyroscope's scale."""
-    return _turning(rotation) and rotation.explained > _CLOSELY
+    return shows_turns(rotation) and rotation.explained > _CLOSELY
 
 
 def least_scale(rotation: RotationFit) -> float:
@@ -139,7 +140,7 @@ def _lags(agreement: Agreement) -> bool:
     if rotation is None or rotation.explained > _FITS:
         return rotation is not None and rotation.coarse
     turning = float(np.sqrt(agreement.gyro_power)) / max(unit_of(rotation.scale), 1.0)
-    return turning > float(_TURNING_RAD_S)
+    return turning > TURNING_RAD_S
 
 
 def judges(cause: Cause, agreement: Agreement) -> bool:
@@ -162,13 +163,9 @@ def shows_mounting(agreement: Agreement) -> bool:
     return rotation is not None and judges_rotation(agreement) and bool((rotation.rotation_std[0] < ROTATION_KNOWN_RAD).all())
 
 
-def _turning(rotation: RotationFit) -> bool:
-    return bool(np.linalg.norm(rotation.excitation) > max(_TURNING_RAD_S, 2.0 * rotation.sigma))
-
-
 def _of_unit(rotation: RotationFit) -> Finding | None:
     unit = unit_of(rotation.scale)
-    if unit == 1.0 or not _turning(rotation) or max(rotation.explained, rotation.mirrored) < _FITS or rotation.scale_std > 0.2:
+    if unit == 1.0 or not shows_turns(rotation) or max(rotation.explained, rotation.mirrored) < _FITS or rotation.scale_std > 0.2:
         return None
     if unit > 1.0:
         text = (
@@ -188,7 +185,7 @@ def _of_sign(rotation: RotationFit) -> Finding | None:
 
     About a single axis a mirror and half a turn are the same: where a mounting explains nearly all, it is the mounting's to say.
     """
-    if not _turning(rotation) or rotation.mirrored < _FITS or rotation.explained > _MOUNTED:
+    if not shows_turns(rotation) or rotation.mirrored < _FITS or rotation.explained > _MOUNTED:
         return None
     if 1.0 - rotation.mirrored > 0.3 * (1.0 - rotation.explained):
         return None

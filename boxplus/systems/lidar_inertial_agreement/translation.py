@@ -54,7 +54,8 @@ class TranslationFit:
     Attributes:
         gravity: (3,) [m/s²]; bias: (3,) of the accelerometer [m/s²]; p_imu_lidar: (3,) [m]; slope: see the module.
         turn: (3,) rotation vector by which the accelerations would turn the mounting, R_imu_lidar ← Exp(turn) R_imu_lidar [rad].
-        covariance: (13, 13) of these, in this order; what it moves by when some poses are left out included.
+        covariance: (13, 13) of these, in this order; what it moves by when some poses are left out included, of the slope with
+            what that leaves unsure where the stretch is short.
         stretches: positions and velocities of the IMU at the beginnings of the stretches.
         sigma: rms of what is left of the positions [m].
         chi2: of it, per degree of freedom, before the covariance was scaled by it.
@@ -145,10 +146,12 @@ def compare_accelerations(
     chi2 = rest / max(freedom - _SHARED, 1)
     # What neighbours share is in the jackknife: beside it poses count as well as they fit, of a state to begin with no better
     # than usual.
-    shared = _jackknife(stretches, whole, prior)
+    shared, groups = _jackknife(stretches, whole, prior)
     inflate = max(chi2, 1.0)
     scaled: NDArray[np.float64] = np.linalg.inv(whole.measured / inflate + whole.known).astype(np.float64) + shared
     fitted: NDArray[np.float64] = np.linalg.inv(whole.measured / max(chi2, _LEAST_CHI2) + whole.known).astype(np.float64) + shared
+    # The slope alone is held against a threshold of some standard deviations.
+    fitted[SLOPE, SLOPE] += (_few_groups(groups) ** 2 - 1.0) * shared[SLOPE, SLOPE]
     begins = []
     for stretch in stretches:
         part = stretch.reduced()
@@ -237,8 +240,8 @@ class _Solution:
 
 def _jackknife(
     stretches: Sequence[_Equations], whole: _Solution, prior: tuple[NDArray[np.float64], NDArray[np.float64]]
-) -> NDArray[np.float64]:
-    """(13, 13) how far the solution moves when half a second of poses is left out, whichever.
+) -> tuple[NDArray[np.float64], int]:
+    """(13, 13) how far the solution moves when half a second of poses is left out, whichever, and of how many groups that is.
 
     Neighbouring registrations share their map and so their errors, which the equations take for independent: a path that is bent
     where a platform moves off fits a wrong slope to millimetres. (Delete-a-group jackknife: Shao and Wu, Annals of Statistics
@@ -255,7 +258,16 @@ def _jackknife(
     groups = len(moved)
     off = np.array(moved) - np.mean(moved, axis=0)
     covariance: NDArray[np.float64] = (groups - 1) / groups * off.T @ off
-    return covariance
+    return covariance, groups
+
+
+def _few_groups(groups: int) -> float:
+    """By how much a standard deviation from so few groups is to be widened for three of it to hold as often as of a known one.
+
+    Quantile of Student's t over that of the normal distribution, at 3: Fisher's expansion. Eight groups: 1.5.
+    """
+    few = 1.0 / max(groups - 1, 1)
+    return 1.0 + few * (2.5 + few * (5.75 + few * 10.1))
 
 
 def _equations(
