@@ -151,7 +151,7 @@ def compare_accelerations(
     scaled: NDArray[np.float64] = np.linalg.inv(whole.measured / inflate + whole.known).astype(np.float64) + shared
     fitted: NDArray[np.float64] = np.linalg.inv(whole.measured / max(chi2, _LEAST_CHI2) + whole.known).astype(np.float64) + shared
     # The slope alone is held against a threshold of some standard deviations.
-    fitted[SLOPE, SLOPE] += (_few_groups(groups) ** 2 - 1.0) * shared[SLOPE, SLOPE]
+    fitted[SLOPE, SLOPE] += (few_groups(groups) ** 2 - 1.0) * shared[SLOPE, SLOPE]
     begins = []
     for stretch in stretches:
         part = stretch.reduced()
@@ -261,13 +261,13 @@ def _jackknife(
     return covariance, groups
 
 
-def _few_groups(groups: int) -> float:
+def few_groups(groups: int) -> float:
     """By how much a standard deviation from so few groups is to be widened for three of it to hold as often as of a known one.
 
     Quantile of Student's t over that of the normal distribution, at 3: Fisher's expansion. Eight groups: 1.5.
     """
     few = 1.0 / max(groups - 1, 1)
-    return 1.0 + few * (2.5 + few * (5.75 + few * 10.1))
+    return 1.0 + few * (2.5 + few * (5.75 + few * (10.1 + few * 12.9)))
 
 
 def _equations(

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from boxplus.filtering.nav_state import STANDARD_GRAVITY
 from boxplus.sensors.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
-from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, wide_prior
+from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, few_groups, wide_prior
 from tests.systems.lidar_inertial_agreement.lidar_path.test_explained_scans import true_path
 from tests.systems.lidar_inertial_agreement.small_platforms import data, handheld
 
@@ -35,6 +36,12 @@ def fit(seed: int, bend_m: float = 0.0, at: float = 0.5, length: float = 1.0) ->
 def test_the_standard_deviation_covers_a_path_that_is_bent_for_a_moment(seed: int, bend_m: float, at: float) -> None:
     found = fit(seed, bend_m, at)
     assert abs(found.slope - 1.0) < 4.0 * found.slope_std + 0.01
+
+
+@pytest.mark.parametrize("groups", [4, 8, 13, 30, 100])
+def test_three_of_a_standard_deviation_from_few_groups_hold_as_often_as_of_a_known_one(groups: int) -> None:
+    quantile = stats.t(groups - 1).ppf(stats.norm.cdf(3.0))
+    assert 3.0 * few_groups(groups) == pytest.approx(quantile, rel=0.05)
 
 
 @pytest.mark.parametrize("scan_s", [0.1, 0.0])
