@@ -61,6 +61,7 @@ class Health:
         rests: bool,
         imu_gap_s: float,
         position_sigma: float,
+        among_cameras: str | None = None,
         apart: str | None = None,
         limits: Sequence[Limit] = (),
     ) -> tuple[Status, tuple[str, ...]]:
@@ -70,6 +71,7 @@ class Health:
             rests: the images stand still, so that the pose is held without landmarks.
             imu_gap_s: longest time between IMU samples before the frame [s].
             position_sigma: standard deviation of the position, all axes together [m].
+            among_cameras: what corners show to be wrong of the cameras, which explains what else differs; None if nothing.
             apart: how the way of the cameras and the IMU's contradict each other; None where they do not.
             limits: of the IMU, which its samples before the frame reach.
         """
@@ -101,7 +103,8 @@ class Health:
                     f"{position_sigma:.1f} m, and the poses before and after it do not belong together"
                 )
         reasons += dict.fromkeys(f"{limit.text}: motion beyond it is not measured" for limit in limits)
-        contradictions = self._contradictions(tracks, fit) + ([] if apart is None else [apart])
+        told = among_cameras, *self._contradictions(tracks, fit), apart
+        contradictions = [text for text in told if text is not None]
         if not contradictions:
             self._agreed_ns = time_ns
         elif (time_ns - self._agreed_ns) * 1e-9 > _SUSTAINED_S and self.contradiction is None:

@@ -32,16 +32,15 @@ from boxplus.sensors.imu_saturation import Limit, Saturation
 from boxplus.sensors.imu_values import measurements
 from boxplus.sensors.repeated_images import RepeatedImages
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
-from boxplus.systems.visual_inertial_odometry.corners.focal_watch import FocalWatch
 from boxplus.systems.visual_inertial_odometry.corners.tracking import FeatureTracker, Tracker
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.estimate import VioEstimate
 from boxplus.systems.visual_inertial_odometry.health import Health, position_sigma
-from boxplus.systems.visual_inertial_odometry.inertial_watch import InertialWatch
 from boxplus.systems.visual_inertial_odometry.known_motion import imu_moves, is_motion
 from boxplus.systems.visual_inertial_odometry.lines.tracking import LineFollower, LineTracker
 from boxplus.systems.visual_inertial_odometry.observations import Fit
 from boxplus.systems.visual_inertial_odometry.rig import Rig
+from boxplus.systems.visual_inertial_odometry.sensor_watches import SensorWatches
 from boxplus.systems.visual_inertial_odometry.start.search import StartSearch
 from boxplus.systems.visual_inertial_odometry.start.start import Start
 from boxplus.systems.visual_inertial_odometry.window import SPARE_NS, Window
@@ -105,9 +104,8 @@ class VisualInertialOdometry:
         self._repeated = RepeatedImages()
         self._time_ns = 0  # of the frame before
         self._health = Health(self.config)
-        self._watch = InertialWatch(self.config.gravity)
+        self._watches = SensorWatches(self.rig, self.config.pixel_sigma, self.config.gravity)
         self._saturation = Saturation()
-        self._focal_watch = FocalWatch(self.rig, self.config.pixel_sigma)
         self._counters: Counter[str] = Counter()
 
     @overload
@@ -188,7 +186,7 @@ class VisualInertialOdometry:
     @property
     def lengths(self) -> tuple[float, float]:
         """By what share lengths of the cameras exceed the IMU's, and its standard deviation; NaN, infinite if nothing tells."""
-        return self._watch.length
+        return self._watches.lengths
 
     def _advance(self, *, final: bool) -> list[VioEstimate]:
         """The frames that are complete, and covered by IMU samples."""
@@ -361,11 +359,11 @@ class VisualInertialOdometry:
         line_ids, line_ends = self.window.lines.ends(self.window.bodies, self.window.mountings.values)
         lines = tracks.lines
         covariance = self.window.covariance
-        self._watch.add(pose, state, covariance, self.window.last_step)
-        if is_keyframe and not rests:  # the same view again has the same errors
-            self._focal_watch.add(tracks)
-        sigma, apart = position_sigma(covariance), self._focal_watch.contradiction or self._watch.contradiction
-        status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, sigma, apart, limits)
+        self._watches.add(pose, state, covariance, self.window.last_step)
+        if is_keyframe and not rests:
+            self._watches.add_keyframe(tracks, pose, state, self._rate(tracks.time_ns))
+        sigma, told = position_sigma(covariance), (self._watches.among_cameras, self._watches.apart)
+        status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, sigma, *told, limits)
         return VioEstimate(
             time_ns=tracks.time_ns,
             status=status,
