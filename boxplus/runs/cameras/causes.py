@@ -33,8 +33,8 @@ _MARGIN_NS = 500_000_000  # of IMU samples on both sides
 
 def likely_causes(
     info: CameraRecordingInfo, events: Iterator[CameraEvent], cameras: int, around_ns: int | None, *, with_imu: bool = True
-) -> list[str]:
-    """Sentences about what does not go together, by readings that need no odometry; none where these find nothing.
+) -> list[Evidence]:
+    """What does not go together, by readings that need no odometry; nothing where these find nothing.
 
     Args:
         info: of the recording.
@@ -56,7 +56,7 @@ def likely_causes(
     found += comparison.of_cameras()
     if with_imu and len(imu):
         found += [*check_repeats(imu), check_saturation(imu), *comparison.with_imu(imu)]
-    return _told(found)
+    return _wrong(found)
 
 
 def calibration_doubts(info: CameraRecordingInfo, events: Iterator[CameraEvent], around_ns: int) -> list[str]:
@@ -70,7 +70,8 @@ def calibration_doubts(info: CameraRecordingInfo, events: Iterator[CameraEvent],
     if compared is None or not len(compared[1]):
         return []
     comparison, imu = compared
-    return _told([finding for finding in comparison.with_imu(imu) if finding.key.endswith(_CALIBRATION)])
+    doubtful = [finding for finding in comparison.with_imu(imu) if finding.key.endswith(_CALIBRATION)]
+    return [sentence(finding) for finding in _wrong(doubtful)]
 
 
 def _pictures(info: CameraRecordingInfo, cameras: int) -> list[CameraStream]:
@@ -118,7 +119,11 @@ def _of_images(name: str, seen: Views) -> list[Evidence]:
     return check_rate(name, np.array(seen.time_ns, np.int64), gap_factor=GAP_FACTOR) + check_views(name, seen)
 
 
-def _told(found: list[Evidence]) -> list[str]:
-    """A sentence for each that is not as it should be."""
-    wrong = [finding for finding in found if finding.verdict != "ok" and finding.value != "unchecked"]
-    return [f"{finding.key} {finding.value}: {finding.text}" for finding in wrong]
+def sentence(finding: Evidence) -> str:
+    """What was found, with its numbers."""
+    return f"{finding.key} {finding.value}: {finding.text}"
+
+
+def _wrong(found: list[Evidence]) -> list[Evidence]:
+    """Those that are not as they should be."""
+    return [finding for finding in found if finding.verdict != "ok" and finding.value != "unchecked"]

@@ -16,7 +16,7 @@ from boxplus._extras import has
 from boxplus.errors import InputError, printable
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
 from boxplus.runs.cameras.camera_run import CameraRun
-from boxplus.runs.cameras.causes import MAY_BE, likely_causes
+from boxplus.runs.cameras.causes import MAY_BE, likely_causes, sentence
 from boxplus.runs.cameras.folder import DirectFolder, claim_camera_folder
 from boxplus.runs.direct.config import DirectRunConfig, dump_direct_config
 from boxplus.runs.direct.frame_log import FrameLogWriter
@@ -132,7 +132,8 @@ class _Run(CameraRun[Estimate, DirectSummary]):
             self.stage = "looking for the cause"
             self.show_progress()
             cameras = 2 if self._cameras.kind == "stereo" else 1
-            self._causes = likely_causes(self._info, self.recording.read_again(), cameras, self._troubled_ns, with_imu=False)
+            found = likely_causes(self._info, self.recording.read_again(), cameras, self._troubled_ns, with_imu=False)
+            self._causes = [sentence(finding) for finding in found]
 
     def push(self, event: CameraEvent) -> list[Estimate]:
         """See `RunLoop.push`."""

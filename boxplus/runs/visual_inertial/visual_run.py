@@ -15,7 +15,7 @@ from boxplus._arguments import as_settings
 from boxplus.errors import InputError, printable
 from boxplus.recordings.cameras.events import CameraEvent, CameraRecording
 from boxplus.runs.cameras.camera_run import CameraRun
-from boxplus.runs.cameras.causes import BEFORE_S, MAY_BE, calibration_doubts, likely_causes
+from boxplus.runs.cameras.causes import BEFORE_S, MAY_BE, calibration_doubts, likely_causes, sentence
 from boxplus.runs.cameras.folder import VioFolder, claim_camera_folder
 from boxplus.runs.cameras.image_gaps import ImageGaps
 from boxplus.runs.cameras.landmark_file import LandmarkFile, LandmarksById, write_lines
@@ -47,7 +47,8 @@ _OWN_STATE = (
     "_images", "_rejected", "_lines_rejected", "_keyframes", "_before_start", "_mountings", "_time_offset_s",
     "_troubled_ns", "_turning", "_image_gaps", "_refusal",
 )  # fmt: skip
-_MUCH_LOST = 0.15  # share of the frames
+_MUCH_LOST, _MUCH_DOUBTED = 0.15, 0.5  # shares of the frames, of the second those that are weak as well: a cause is looked for
+_MOST_LOST = 0.5  # share of the frames from which on the whole run is not to be trusted
 _CARRIED = 10  # corners that moved along with the camera, which are no accident
 _LATE_S = 5.0  # one camera that moves from the first image on finds its start within four seconds
 _EARLIER = "let a recording start at rest, or with a motion that changes, in view of corners at all distances"
@@ -139,6 +140,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         self._troubled_ns: int | None = None
         self._refusal: str | None = None  # why the last frame without a start gave none
         self._causes: list[str] = []
+        self._refuted: str | None = None  # the first cause with which nothing that was measured can be trusted
         self._doubts: list[str] = []
         self._turning, self._image_gaps = Turning(BEFORE_S), ImageGaps()
         self._longest_gap_s = config.odometry.max_imu_gap
@@ -169,17 +171,19 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         """See `RunLoop.at_end`."""
         super().at_end(state)
         self.seconds["writing"] += self._line_file.write()
-        lost = self.counts.status.get("lost", 0) > _MUCH_LOST * self.counts.count
         if state != "finished":
             return
         turning_ns = self._turning.until_ns()
-        if not self.counts.count or self._odometry.contradiction is not None or lost:
+        if not self.counts.count or self._odometry.contradiction is not None or self._is_much_doubted():
             self.stage = "looking for the cause"
             self.show_progress()
             longest = self.counts.longest_imu_gap_s
             if longest > self._longest_gap_s:
                 self._causes.append(f"a gap of {longest:.2f} s in the samples of the IMU")
-            self._causes += likely_causes(self._info, self.recording.read_again(), len(self._rig.cameras), self._troubled_ns)
+            around_ns = turning_ns if self.counts.count and self._troubled_ns is None else self._troubled_ns
+            found = likely_causes(self._info, self.recording.read_again(), len(self._rig.cameras), around_ns)
+            self._causes += [sentence(finding) for finding in found]
+            self._refuted = next((sentence(finding) for finding in found if finding.verdict == "error"), None)
         elif turning_ns is not None:
             self.stage = "comparing shutter and focal length with the gyroscope"
             self.show_progress()
@@ -280,7 +284,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
             start_problem=self._odometry.start_problem,
             keyframes=self._keyframes,
             frames_before_start=self._before_start,
-            contradiction=self._odometry.contradiction,
+            contradiction=self._contradiction(),
             imu_samples_read=counts.imu_samples_read,
             rejected={
                 "recording": self.recording.rejected,
@@ -294,6 +298,22 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
             lengths=None if start is None else _length_facts(*self._odometry.lengths),
             lines=len(self._lines),
         )
+
+    def _share(self, *status: str) -> float:
+        """Of the frames, 0 to 1."""
+        return sum(self.counts.status.get(one, 0) for one in status) / max(self.counts.count, 1)
+
+    def _is_much_doubted(self) -> bool:
+        return self._share("lost") > _MUCH_LOST or self._share("lost", "weak") > _MUCH_DOUBTED
+
+    def _contradiction(self) -> str | None:
+        """Why the run is not to be trusted, whatever the status of its frames; None where nothing says so."""
+        if self._odometry.contradiction is not None:
+            return self._odometry.contradiction
+        lost, weak = self._share("lost"), self._share("weak")
+        if self._refuted is not None and self._is_much_doubted():
+            return f"{lost:.0%} of the frames are lost and {weak:.0%} weak, and {self._refuted}"
+        return f"{lost:.0%} of the frames are lost ({_MOST_LOST:.0%} at most)" if lost > _MOST_LOST else None
 
     def _gap_warnings(self) -> list[WarningFacts]:
         """Times on the way at which the IMU was silent, or the first camera was, and enough was known to go on."""

@@ -11,7 +11,7 @@ import pytest
 
 from boxplus.recordings.cameras.events import CameraEvent
 from boxplus.recordings.cameras.info import CameraRecordingInfo
-from boxplus.runs.cameras.causes import calibration_doubts, likely_causes
+from boxplus.runs.cameras.causes import calibration_doubts, likely_causes, sentence
 from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, make_rig, simulate_cameras
 
@@ -36,7 +36,8 @@ def test_a_sound_recording_has_no_cause(recorded: tuple[CameraRecordingInfo, lis
 
 def test_a_clock_that_is_off_is_named_with_its_offset(recorded: tuple[CameraRecordingInfo, list[CameraEvent]]) -> None:
     info, events = recorded
-    (said,) = likely_causes(info, (late(event, 50_000_000) for event in events), 1, None)
+    (found,) = likely_causes(info, (late(event, 50_000_000) for event in events), 1, None)
+    said = sentence(found)
     assert "offset of the clocks" in said
     offset_ms = float(said.split(" ms")[0].split()[-1])
     assert abs(offset_ms - 50.0) < 10.0
@@ -63,8 +64,9 @@ def test_a_mounting_the_wrong_way_round_is_named(recorded: tuple[CameraRecording
     (camera,) = info.cameras
     assert camera.T_body_camera is not None
     inverted = dataclasses.replace(camera, T_body_camera=np.linalg.inv(camera.T_body_camera))
-    (said,) = likely_causes(dataclasses.replace(info, cameras=[inverted]), iter(events), 1, None)
-    assert "the inverse of what is stated fits" in said
+    (found,) = likely_causes(dataclasses.replace(info, cameras=[inverted]), iter(events), 1, None)
+    assert "the inverse of what is stated fits" in sentence(found)
+    assert found.verdict == "error"
 
 
 @pytest.mark.parametrize(("trouble_s", "read_s"), [(None, 16.0), (5.0, 16.0), (40.0, 42.0)])
@@ -109,7 +111,8 @@ def test_images_that_come_again_with_another_stamp_are_no_shutter_and_no_turn(
                 yield dataclasses.replace(event, time_ns=event.time_ns + 40_000_000)
 
     assert calibration_doubts(info, twice(), end_ns) == []
-    assert all("imu" not in said and "shutter" not in said for said in likely_causes(info, twice(), 1, None))
+    said = [sentence(found) for found in likely_causes(info, twice(), 1, None)]
+    assert all("imu" not in text and "shutter" not in text for text in said)
 
 
 @pytest.mark.parametrize("seconds", [0.1, 1.0])
@@ -131,6 +134,6 @@ def test_an_imu_that_repeats_one_value_for_long_is_a_cause(
                 event = dataclasses.replace(event, gyro=gyro)
             yield event
 
-    said = [cause for cause in likely_causes(info, stuck(), 1, None) if cause.startswith("imu_repeats")]
+    said = [found for found in likely_causes(info, stuck(), 1, None) if found.key == "imu_repeats"]
     assert len(said) == (seconds > 0.2)
-    assert all("the gyroscope for 0.9" in cause or "the gyroscope for 1.0" in cause for cause in said)
+    assert all("the gyroscope for 0.9" in found.text or "the gyroscope for 1.0" in found.text for found in said)

@@ -20,6 +20,7 @@ from boxplus.manifolds import quaternion, so3
 from boxplus.runs.visual_inertial.config import VioRunConfig
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
 from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.imu import ImuSamples
 from boxplus.simulation.cameras import CameraFault, as_camera_recording, faults, make_rig, simulate_cameras
 from boxplus.simulation.cameras.sensor import CameraRig
 
@@ -49,9 +50,11 @@ class Outcome(NamedTuple):
     error: float = float("nan")
 
 
-def run(folder: Path, fault: CameraFault | None, rig: Rig, seconds: float, rate_hz: float, seed: int = SEED) -> Outcome:
+def run(
+    folder: Path, fault: CameraFault | None, rig: Rig, seconds: float, rate_hz: float, scenario: str = "room_moving"
+) -> Outcome:
     made = rig if isinstance(rig, CameraRig) else make_rig(rig, None, 0.3, rate_hz)
-    simulation = simulate_cameras("room_moving", seed, duration_s=seconds, rig=made)
+    simulation = simulate_cameras(scenario, SEED, duration_s=seconds, rig=made)
     try:
         with as_camera_recording(simulation, fault) as recording:
             summary = run_visual_odometry(recording, folder / "run", CONFIG)
@@ -125,6 +128,23 @@ def test_without_a_start_the_refusal_names_the_cause(
     outcome = run(tmp_path, fault, rig, seconds, rate_hz)
     assert outcome.end == "refused"
     assert fault.named_in(outcome.said), outcome.said
+
+
+@pytest.mark.parametrize("rotvec_deg", [(90.0, 0.0, 0.0), (0.0, 180.0, 0.0)], ids=str)
+def test_an_imu_that_is_turned_beside_one_camera_is_named_and_not_to_be_trusted(
+    tmp_path: Path, rotvec_deg: tuple[float, float, float]
+) -> None:
+    R = so3.exp(np.deg2rad(rotvec_deg))
+
+    def turned(incoming: Iterable[faults.Event]) -> Iterator[faults.Event]:
+        for event in incoming:
+            if isinstance(event, ImuSamples):
+                event = ImuSamples(event.time_ns, event.gyro @ R.T, event.accel @ R.T)
+            yield event
+
+    fault = CameraFault("turned_imu", "an IMU that is turned", ("r_imu_cam0",), "inspect", events=turned)
+    outcome = run(tmp_path, fault, "mono", 10.0, 15.0, scenario="room")
+    assert outcome.end == "contradicted" and fault.named_in(outcome.said), outcome
 
 
 def test_a_baseline_that_the_imu_contradicts_is_named(tmp_path: Path) -> None:
