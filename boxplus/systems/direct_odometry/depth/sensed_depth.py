@@ -58,11 +58,13 @@ def rgbd_depth(depth: ArrayLike, image: Image, noise: tuple[float, float, float]
         raise InputError("depth not negative [m]", f"{z.min()}", "mark pixels without depth by 0 or NaN")
     known = z[::4, ::4]
     known = known[known > 0.0]
-    if len(known) and not _NEAREST <= float(np.median(known)) <= _FARTHEST:
+    typical = float(np.median(known)) if len(known) else _NEAREST
+    if not _NEAREST <= typical <= _FARTHEST:
+        these = "millimetres" if typical > _FARTHEST else "metres that were divided by 1000"
         raise InputError(
             f"depths [m] with a median of {_NEAREST:g} to {_FARTHEST:g}",
-            f"a median of {float(np.median(known)):.4g}",
-            "check the unit of the depth: are these millimetres?",
+            f"a median of {typical:.4g}",
+            f"check the unit of the depth: are these {these}?",
         )
     a, b, c = noise
     sigma = a + b * np.maximum(z - c, 0.0) ** 2

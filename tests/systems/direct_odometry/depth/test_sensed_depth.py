@@ -61,9 +61,11 @@ def test_repeated_stripes_are_no_match() -> None:
     assert np.count_nonzero(z) < 50
 
 
-@pytest.mark.parametrize("factor", [1000.0, 0.001], ids=["millimetres", "kilometres"])
-def test_depths_that_are_no_metres_are_refused(factor: float) -> None:
-    with pytest.raises(InputError, match="check the unit of the depth"):
+@pytest.mark.parametrize(
+    ("factor", "advice"), [(1000.0, r"are these millimetres\?"), (0.001, r"are these metres that were divided by 1000\?")]
+)
+def test_depths_that_are_no_metres_are_refused_and_the_unit_is_guessed(factor: float, advice: str) -> None:
+    with pytest.raises(InputError, match=f"check the unit of the depth: {advice}"):
         rgbd_depth(np.full(SHAPE, 2.0 * factor), IMAGE, NOISE)
 
 
