@@ -64,7 +64,7 @@ def decode_raw(encoding: str, height: int, width: int, step: int, big_endian: bo
         RecordingError: a Bayer mosaic, and OpenCV is not installed.
     """
     if encoding not in ENCODINGS:
-        raise MalformedImageError(f"unknown encoding {encoding!r}")
+        raise MalformedImageError(f"unknown encoding {encoding!r}, where {', '.join(ENCODINGS)} are read")
     kind, channels, order = _RAW.get(encoding, ("u1", 1, None))
     dtype = np.dtype(kind).newbyteorder(">" if big_endian else "<")
     row = width * channels * dtype.itemsize

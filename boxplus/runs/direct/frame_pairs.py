@@ -60,7 +60,8 @@ def choose_cameras(info: CameraRecordingInfo, *, mono: bool = False) -> ChosenCa
     depths = [camera for camera in info.cameras if camera.kind == "depth"]
     if not intensity:
         found = ", ".join(f"{camera.name} ({camera.kind})" for camera in info.cameras) or "none"
-        raise RecordingError("images of intensities", found, "depth alone has no grey values to compare: record images with it")
+        advice = "record images with it, grey ones of 16 bits as mono16: 16UC1 is depth (REP 118)"
+        raise RecordingError("images of intensities", found, f"depth alone has no grey values to compare: {advice}")
     first = intensity[0]
     one = first.calibrated()
     if not isinstance(one.model, Pinhole):

@@ -35,7 +35,10 @@ def rig_of_recording(info: CameraRecordingInfo, config: VioConfig) -> Rig:
     cameras = [camera for camera in info.cameras if camera.kind == "intensity"]
     if not cameras or [camera.index for camera in cameras] != list(range(len(cameras))):
         found = ", ".join(f"{camera.name} ({camera.kind})" for camera in info.cameras)
-        raise InputError("intensity images of the first cameras", found, "choose their topics with --image-topics")
+        advice = (
+            "choose their topics with --image-topics; grey images of 16 bits are mono16, 16UC1 and 32FC1 are depths (REP 118)"
+        )
+        raise InputError("intensity images of the first cameras", found, advice)
     if config.cameras == "first":
         cameras = cameras[:1]
     try:

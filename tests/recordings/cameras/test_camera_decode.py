@@ -58,7 +58,7 @@ def test_a_mosaic_of_one_colour_is_that_colour(pattern: str) -> None:
 
 def test_raw_images_that_do_not_fit_are_refused() -> None:
     for encoding, height, width, step, size, reason in (
-        ("yuv422", 2, 2, 4, 8, "unknown encoding 'yuv422'"),
+        ("yuv422", 2, 2, 4, 8, "unknown encoding 'yuv422', where mono8, "),
         ("mono8", 2, 2, 1, 4, "4 bytes in rows of 1 for 2x2 pixels"),
         ("mono8", 2, 2, 2, 3, "3 bytes in rows of 2"),
         ("rgb8", 0, 2, 6, 12, "a size of 2x0 pixels"),
