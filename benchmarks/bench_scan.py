@@ -22,7 +22,7 @@ from metrics import Metric, run_as_script
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from boxplus.sensors.downsampling import VoxelFilter
+from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.simulation import Simulation, simulate
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate

@@ -46,7 +46,7 @@ from boxplus.recordings.recording import Recording
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.slam.config import SlamRunConfig, load_slam_config
 from boxplus.runs.slam.slam_run import run_slam
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import SpinningLidar
 from boxplus.simulation.drifting_drive import DriftConfig, simulate_drift
 from boxplus.simulation.live_recording import as_recording

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion, so3
 from boxplus.residuals.inertial.imu_noise import ImuNoise
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation.cameras.feature_tracks import TrackModel, track_points
 from boxplus.simulation.imu import BiasWalk, ImuModel, Vibration, measure
 from boxplus.simulation.motions.manoeuvres import constant_turn, constant_velocity, drone_within, handheld, level

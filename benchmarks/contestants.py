@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
-from boxplus.sensors.geodesy import EnuFrame
+from boxplus.sensors.satellites.geodesy import EnuFrame
 from boxplus.simulation.drifting_drive import DriftConfig, simulate_drift
 from boxplus.simulation.gnss import GnssConfig, simulate_gnss
 from boxplus.systems.georeference.georeference import georeference

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError
 from boxplus.evaluation.nees import nees
 from boxplus.manifolds import quaternion, se3, so3
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Scenario, Simulation, SpinningLidar
 from boxplus.simulation.motions import trajectories
 from boxplus.simulation.worlds.sites import tunnel

@@ -56,10 +56,10 @@ from .recordings.options import RecordingOptions as RecordingOptions
 from .recordings.recording import Recording as Recording
 from .runs.inspection.diagnosis import Diagnosis as Diagnosis
 from .runs.inspection.diagnosis import diagnose as diagnose
-from .sensors.camera_image import CameraImage as CameraImage
-from .sensors.image import Image as Image
-from .sensors.imu import ImuSamples as ImuSamples
-from .sensors.scan import Scan as Scan
+from .sensors.images.camera_image import CameraImage as CameraImage
+from .sensors.images.image import Image as Image
+from .sensors.inertial.imu import ImuSamples as ImuSamples
+from .sensors.lidar.scan import Scan as Scan
 from .simulation.simulation import Simulation as Simulation
 from .simulation.simulation import simulate as simulate
 from .sparse.cholesky import SparseCholesky as SparseCholesky

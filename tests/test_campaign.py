@@ -17,8 +17,8 @@ from boxplus.filtering.nav_state import TANGENT
 from boxplus.formats.trajectory import Trajectory, read_trajectory, write_tum
 from boxplus.manifolds import quaternion, so3
 from boxplus.recordings import RecordingOptions, open_recording
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Simulation, faults, write_recording
 from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Fault
 from boxplus.simulation.faults import Event
 from lio_campaign.judge import Truth

@@ -23,7 +23,7 @@ from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings import open_recording
 from boxplus.recordings.options import RecordingOptions
 from boxplus.recordings.recording import Event, Recording, Tally
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation import Fault, Motion
 from lio_campaign.draws import EXTRINSICS, FAULTY_SHARE, Kinds
 from lio_campaign.spoil import FAULT_KINDS, MOUNTING_FAULTS, Setting, deliver, draw_spoiling

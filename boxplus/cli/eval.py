@@ -268,7 +268,7 @@ def _against_fixes(
     from boxplus.evaluation.against_fixes import compare_with_fixes
     from boxplus.recordings.gnss_source import read_fixes
     from boxplus.runs.slam.gnss_output import read_origin
-    from boxplus.sensors.gnss import antenna_offset
+    from boxplus.sensors.satellites.gnss import antenna_offset
 
     if align is _Alignment.origin:
         raise InputError("--align yaw, se3, sim3 or none, for positions by satellite", "origin", "a fix has no orientation")

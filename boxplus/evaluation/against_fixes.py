@@ -13,8 +13,8 @@ from boxplus.evaluation.alignment import Alignment, PositionAlignment, align
 from boxplus.evaluation.statistics import Statistics
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion
-from boxplus.sensors.geodesy import EnuFrame
-from boxplus.sensors.gnss import GnssFixes
+from boxplus.sensors.satellites.geodesy import EnuFrame
+from boxplus.sensors.satellites.gnss import GnssFixes
 from boxplus.systems.georeference.attachment import poses_between
 from boxplus.systems.georeference.start import extent_of, find_start
 

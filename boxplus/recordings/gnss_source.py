@@ -10,7 +10,7 @@ from boxplus.recordings.bags.open_container import open_container
 from boxplus.recordings.kitti import sensor_files
 from boxplus.recordings.kitti_oxts import oxts_fixes
 from boxplus.recordings.options import ANY_GNSS
-from boxplus.sensors.gnss import GnssFixes
+from boxplus.sensors.satellites.gnss import GnssFixes
 
 _FILES = (".bag", ".mcap", ".db3")
 

@@ -21,9 +21,9 @@ from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, T
 from boxplus.recordings.kitti_oxts import oxts_fixes, read_oxts
 from boxplus.recordings.options import NO_GNSS, NO_IMU, NO_POINT_TIME, RecordingOptions, check_start
 from boxplus.recordings.recording import Event, Recording, Tally
-from boxplus.sensors.gnss import GnssFixes
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
+from boxplus.sensors.satellites.gnss import GnssFixes
 
 _POINT_BYTES = 16
 _CALIBRATION = "calib_imu_to_velo.txt"

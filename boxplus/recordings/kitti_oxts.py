@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.gnss import NO_FIX, GnssFixes
+from boxplus.sensors.satellites.gnss import NO_FIX, GnssFixes
 
 _COLUMNS = 30
 _ACCEL, _GYRO = slice(11, 14), slice(17, 20)

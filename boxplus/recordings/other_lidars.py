@@ -14,9 +14,9 @@ from boxplus.recordings.bags.probe import find_out, static_chain
 from boxplus.recordings.info import Evidence, OtherLidarInfo, RecordingInfo
 from boxplus.recordings.options import OtherLidar, RecordingOptions
 from boxplus.recordings.recording import Event, Tally
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
-from boxplus.sensors.scan_merger import ScanMerger
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
+from boxplus.sensors.lidar.scan_merger import ScanMerger
 
 LidarEvent = tuple[int, Scan] | ImuSamples
 """A scan with the number of its LiDAR, 0 the first one, or samples of the IMU."""

@@ -20,8 +20,8 @@ from boxplus.recordings.bags.container import READ_ERRORS
 from boxplus.recordings.info import Evidence, PointTimeReading, RecordingInfo, Topic, no_imu
 from boxplus.recordings.options import NO_IMU, RecordingOptions, check_start
 from boxplus.recordings.recording import Event, Recording, Tally
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 
 _LOG = logging.getLogger(__name__)
 

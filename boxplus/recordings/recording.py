@@ -12,10 +12,10 @@ from typing import Generic, Protocol, Self, TypeVar
 
 from boxplus.errors import RecordingError
 from boxplus.recordings.info import Evidence, RecordingInfo
-from boxplus.sensors.gnss import GnssFixes
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
-from boxplus.sensors.scan_merger import LidarShare, ScanMerger
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
+from boxplus.sensors.lidar.scan_merger import LidarShare, ScanMerger
+from boxplus.sensors.satellites.gnss import GnssFixes
 
 _LOG = logging.getLogger(__name__)
 

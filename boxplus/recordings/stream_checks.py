@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.recordings.info import Evidence, Verdict
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 
 _MANY_NEAR = 0.1
 _MANY_NOT_FINITE = 0.5

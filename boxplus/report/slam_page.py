@@ -19,7 +19,7 @@ from boxplus.report.skeleton import html_table, picture, tiles, warnings_section
 from boxplus.runs.slam.loop_file import why_refused
 from boxplus.runs.slam.result import SlamResult
 from boxplus.runs.slam.summary import GnssFacts
-from boxplus.sensors.geodesy import EnuFrame
+from boxplus.sensors.satellites.geodesy import EnuFrame
 from boxplus.systems.slam.loop import Loop
 
 _PLACE, _QUERY = "#8a8f98", STATUS["lost"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from boxplus._words import either
 from boxplus.runs.run_facts import Distribution, Gap, WarningFacts, WeakInterval
-from boxplus.sensors.imu_values import BEYOND, EMPTY, GLITCH, NOT_FINITE
+from boxplus.sensors.inertial.imu_values import BEYOND, EMPTY, GLITCH, NOT_FINITE
 
 _MOST_ENTRIES = 1000
 _GAP_FACTOR = 3.0

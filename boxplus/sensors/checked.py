@@ -13,8 +13,8 @@ import numpy as np
 
 from boxplus._numbers import is_array
 from boxplus.errors import InputError
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 
 
 def checked_imu(samples: ImuSamples) -> ImuSamples:

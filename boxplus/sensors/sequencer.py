@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.sensors.checked import checked_imu, checked_scan
-from boxplus.sensors.glitch_filter import GlitchFilter
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import measurements
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.glitch_filter import GlitchFilter
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_values import measurements
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.time_steps import TimeSteps
 
 _COMPARED = 500  # points, of scans that have as many

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from boxplus._settings import suggestion
 from boxplus.errors import InputError
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 
 Event = Scan | ImuSamples
 Times = NDArray[np.int64]

@@ -12,8 +12,8 @@ from boxplus._arguments import as_settings
 from boxplus._settings import Settings
 from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.se3 import SE3
-from boxplus.sensors.geodesy import EnuFrame
-from boxplus.sensors.gnss import GnssFixes
+from boxplus.sensors.satellites.geodesy import EnuFrame
+from boxplus.sensors.satellites.gnss import GnssFixes
 
 Floats = NDArray[np.float64]
 

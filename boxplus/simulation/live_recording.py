@@ -14,9 +14,9 @@ from boxplus.manifolds import quaternion
 from boxplus.recordings.info import Evidence, OtherLidarInfo, PointTimeReading, RecordingInfo, Topic
 from boxplus.recordings.other_lidars import LidarEvent, merged_events
 from boxplus.recordings.recording import Event, Recording, Tally
-from boxplus.sensors.geodesy import EnuFrame
-from boxplus.sensors.gnss import GnssFixes
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
+from boxplus.sensors.satellites.geodesy import EnuFrame
+from boxplus.sensors.satellites.gnss import GnssFixes
 from boxplus.simulation.faults import Fault
 from boxplus.simulation.gnss import GnssConfig, simulate_gnss
 from boxplus.simulation.several_lidars import Measured, MountedLidar, other_events

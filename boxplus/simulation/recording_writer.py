@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from boxplus.errors import InputError
 from boxplus.formats.output import atomic_file, make_folder, output_error
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation.bag_writer import (
     FIX_TYPE,
     IMU_DELAY_NS,

@@ -13,8 +13,8 @@ from boxplus._numbers import as_floats, is_finite
 from boxplus._settings import Settings
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation.imu import ImuModel, SimulatedImu
 from boxplus.simulation.lidar import LidarModel
 from boxplus.simulation.motions.spline import Motion, span_of

@@ -15,7 +15,7 @@ from boxplus.cli import app
 from boxplus.formats.clouds.ply import read_ply
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings.cameras.open import open_camera_recording
-from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.images.camera_image import CameraImage
 
 SHOWN = 330  # image to show
 

@@ -18,7 +18,7 @@ from boxplus.formats.trajectory import Trajectory, write_tum
 from boxplus.manifolds import se3
 from boxplus.recordings.gnss_source import read_fixes
 from boxplus.runs.slam.gnss_output import read_origin
-from boxplus.sensors.geodesy import EnuFrame
+from boxplus.sensors.satellites.geodesy import EnuFrame
 from boxplus.simulation.gnss import GnssConfig, simulate_gnss
 from tests.bags import START_NS, Content, write_bag
 

@@ -15,7 +15,7 @@ from PIL import Image
 from boxplus.errors import InputError, OutputError
 from boxplus.formats.geotiff import write_geotiff
 from boxplus.formats.ros_map import write_ros_map
-from boxplus.sensors.geodesy import EnuFrame
+from boxplus.sensors.satellites.geodesy import EnuFrame
 
 
 def test_a_floor_plan_is_what_map_server_reads(tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ import pytest
 from boxplus.errors import RecordingError
 from boxplus.recordings import RecordingOptions, open_recording
 from boxplus.recordings.kitti import read_times
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 
 START = np.datetime64("2011-09-26T13:02:25.100000000", "ns")
 R_VELO_IMU = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

@@ -11,8 +11,8 @@ import pytest
 
 from boxplus.errors import RecordingError
 from boxplus.recordings import open_recording, pcap
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 
 OUSTER = "clouds/ouster-sdk-3scan/OS-1-128_v2.3.0_1024x10_lb_n3.pcap"
 

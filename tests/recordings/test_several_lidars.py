@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from boxplus.errors import AmbiguityError, InputError, RecordingError
 from boxplus.manifolds import so3
 from boxplus.recordings import OtherLidar, RecordingOptions, open_recording
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import (
     MountedLidar,
     RosetteLidar,

@@ -27,7 +27,7 @@ from boxplus.runs.lidar_inertial.statistics import RunStatistics
 from boxplus.runs.lidar_inertial.summary import read_summary
 from boxplus.runs.storage import state_codec
 from boxplus.runs.storage.state_codec import read_state, write_state
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation import SpinningLidar, simulate
 from boxplus.simulation.live_recording import as_recording
 from boxplus.simulation.recording_writer import write_recording

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Simulation, faults
 from boxplus.simulation.live_recording import as_recording
 from tests.simulation.small_simulations import small

@@ -14,8 +14,8 @@ from boxplus.errors import InputError, OutputError
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings import RecordingOptions, open_recording
 from boxplus.recordings.bags.open_container import open_container
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Simulation, SimulationConfig, faults
 from boxplus.simulation.bag_writer import BagFormat as Format
 from boxplus.simulation.gnss import RECEIVERS

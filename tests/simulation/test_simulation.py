@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from boxplus.errors import InputError
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import SCENARIOS, RosetteLidar, Simulation, SpinningLidar, make_scenario, mounting, simulate
 from tests.simulation.small_simulations import small
 

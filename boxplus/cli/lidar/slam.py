@@ -87,7 +87,7 @@ def slam(
     """
     from boxplus.runs.slam.config import load_slam_config
     from boxplus.runs.slam.loop_file import read_loop_decisions
-    from boxplus.sensors.gnss import antenna_offset
+    from boxplus.sensors.satellites.gnss import antenna_offset
 
     gnss: dict[str, object] = {"utm": True} if utm else {}
     if gnss_lever_arm is not None:

@@ -23,9 +23,9 @@ from boxplus.recordings.info import PointTimeReading, RecordingInfo
 from boxplus.recordings.options import RecordingOptions
 from boxplus.recordings.other_lidars import LidarEvent, find_out_all, merged_events
 from boxplus.recordings.recording import Event, Recording, Tally
-from boxplus.sensors.gnss import GnssFixes
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
+from boxplus.sensors.satellites.gnss import GnssFixes
 
 _LARGEST_IMU_BLOCK = 1000
 _LARGEST_IMU_VALUE = 1e5

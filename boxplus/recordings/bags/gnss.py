@@ -10,7 +10,7 @@ from boxplus.recordings.bags.messages import MalformedMessageError, parse_nav_sa
 from boxplus.recordings.bags.transforms import Transform, chain
 from boxplus.recordings.info import Evidence
 from boxplus.recordings.options import ANY_GNSS, NO_GNSS
-from boxplus.sensors.gnss import GnssFixes
+from boxplus.sensors.satellites.gnss import GnssFixes
 
 NAV_SAT_FIX = "sensor_msgs/NavSatFix"
 _FEW = 5  # messages looked at for the name of the antenna's frame

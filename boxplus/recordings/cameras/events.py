@@ -13,8 +13,8 @@ from boxplus.recordings.cameras.decode import MalformedImageError, Pixels
 from boxplus.recordings.cameras.info import CameraRecordingInfo, CameraStream, ImuStream
 from boxplus.recordings.imu_units import ACCEL_SCALE, GYRO_SCALE
 from boxplus.recordings.recording import EventStream, Tally
-from boxplus.sensors.camera_image import CameraImage
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.camera_image import CameraImage
+from boxplus.sensors.inertial.imu import ImuSamples
 
 CameraEvent = CameraImage | ImuSamples
 

@@ -13,7 +13,7 @@ from boxplus.recordings.cameras.imu_table import imu_stream, read_imu_table
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.imu_units import ACCEL_SCALE, GYRO_SCALE
 from boxplus.residuals.inertial.imu_noise import ImuNoise
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.camera_calibration.target import AprilGrid
 
 _SMALLEST_TAG_M, _LARGEST_TAG_M = 0.004, 2.0

@@ -19,8 +19,8 @@ from boxplus.runs.inspection.cameras.comparison import Comparison
 from boxplus.runs.inspection.cameras.stereo import check_synchronisation
 from boxplus.runs.inspection.cameras.views import GAP_FACTOR, Views, check_corners, check_views
 from boxplus.runs.inspection.imu_checks import check_repeats, check_saturation
-from boxplus.sensors.eight_bits import EightBits
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.eight_bits import EightBits
+from boxplus.sensors.inertial.imu import ImuSamples
 
 MAY_BE = "this may be the cause"
 _CALIBRATION = ("_shutter", "_focal_length")  # what an odometry may take for a motion, and be off by little enough to say nothing

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 
 _BIN_NS = 100_000_000  # over which rates are averaged: vibration is no turning
 _LIVELY, _LEAST = 0.25, 0.05  # rad/s, root mean square: enough to look no further, and too little to be compared

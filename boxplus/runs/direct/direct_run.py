@@ -24,7 +24,7 @@ from boxplus.runs.direct.frame_pairs import Frame, FramePairs, choose_cameras
 from boxplus.runs.direct.summary import DirectSummary, StreamFacts
 from boxplus.runs.run_facts import State, WarningFacts
 from boxplus.runs.run_loop import Progress
-from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.images.camera_image import CameraImage
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry
 from boxplus.systems.direct_odometry.estimate import Estimate
 from boxplus.systems.direct_odometry.snapshot import restore as restore_odometry

@@ -13,7 +13,7 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import RecordingError
 from boxplus.manifolds import quaternion
 from boxplus.recordings.cameras.info import CameraRecordingInfo, CameraStream
-from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.images.camera_image import CameraImage
 from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair
 
 _SAME_PLACE = 1e-6

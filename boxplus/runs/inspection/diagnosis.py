@@ -27,8 +27,8 @@ from boxplus.runs.inspection.gnss_checks import check_gnss, check_receivers
 from boxplus.runs.inspection.imu_checks import check_rest, check_saturation, check_values, first_second, quiet_stretch
 from boxplus.runs.inspection.lidar_checks import examine_other_lidars
 from boxplus.runs.inspection.stretches import Stretch, gather_scans, lively_stretches
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import in_order
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import in_order
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
 from boxplus.systems.lidar_inertial_agreement.hypotheses import judges_clocks, judges_rotation
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path

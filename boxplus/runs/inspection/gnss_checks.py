@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from boxplus.recordings.info import Evidence
 from boxplus.recordings.stream_checks import check_rate
-from boxplus.sensors.geodesy import EnuFrame, utm_epsg
-from boxplus.sensors.gnss import STATUS_NAMES, GnssFixes
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.satellites.geodesy import EnuFrame, utm_epsg
+from boxplus.sensors.satellites.gnss import STATUS_NAMES, GnssFixes
 
 _APART = 10.0  # [m] more than antennas of one vehicle and their noise
 _BEYOND = "beyond 90° of latitude or 180° of longitude"

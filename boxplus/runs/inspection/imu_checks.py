@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from boxplus.recordings.imu_units import STANDARD_GRAVITY
 from boxplus.recordings.info import Evidence
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_saturation import limits_of
-from boxplus.sensors.imu_values import beyond, empty, finite, glitches
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_saturation import limits_of
+from boxplus.sensors.inertial.imu_values import beyond, empty, finite, glitches
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
 
 _WINDOW_S = 0.5

@@ -16,7 +16,7 @@ from boxplus.recordings.recording import Recording
 from boxplus.recordings.stream_checks import StreamLog, check_points, check_rate, check_rejected
 from boxplus.runs.lidar_inertial.first_lidar_alone import LONGEST_S, compare_by_first_alone
 from boxplus.runs.lidar_inertial.lidar_facts import watch_of
-from boxplus.sensors.scan_merger import LidarShare
+from boxplus.sensors.lidar.scan_merger import LidarShare
 from boxplus.systems.lidar_inertial_agreement.hypotheses import matrix_text
 from boxplus.systems.several_lidars.judgement import PairJudgement
 

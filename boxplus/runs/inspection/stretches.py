@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 from boxplus.recordings.recording import Recording
 from boxplus.runs.inspection.imu_checks import liveliest_stretch
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned
 
 _MARGIN_NS = 900_000_000

@@ -15,8 +15,8 @@ from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.recordings.recording import Event, Recording, end_ns
 from boxplus.runs.lidar_inertial.rehearsal import rehearse
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
 from boxplus.systems.lidar_inertial_agreement.finding import Cause, Finding
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions, judges_rotation

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from boxplus.recordings.recording import Event
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_odometry.odometry import LidarOdometry
 from boxplus.systems.several_lidars.watch import LidarWatch
 

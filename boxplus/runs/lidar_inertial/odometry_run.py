@@ -30,8 +30,8 @@ from boxplus.runs.resumable_run import ResumableRun
 from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_folder import RunFolder, claim_run_folder
 from boxplus.runs.run_loop import Progress, peak_memory_mb, versions
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import BEFORE_START, REPEATED
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from boxplus.errors import BoxplusError
 from boxplus.filtering.nav_state import T_P_L, T_THETA_L, TANGENT
 from boxplus.recordings.recording import Event, end_ns
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry

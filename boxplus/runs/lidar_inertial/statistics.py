@@ -11,8 +11,8 @@ from boxplus.filtering.nav_state import T_THETA_L
 from boxplus.runs.estimate_statistics import EstimateStatistics, GapWatch
 from boxplus.runs.lidar_inertial.first_points import first_points_of
 from boxplus.runs.run_facts import Gap, WarningFacts
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING
 

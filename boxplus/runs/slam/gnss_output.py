@@ -18,7 +18,7 @@ from boxplus.recordings.recording import Recording
 from boxplus.runs.slam.config import SlamRunConfig
 from boxplus.runs.slam.folder import SlamFolder
 from boxplus.runs.slam.summary import GnssFacts
-from boxplus.sensors.geodesy import EnuFrame, to_utm, utm_epsg
+from boxplus.sensors.satellites.geodesy import EnuFrame, to_utm, utm_epsg
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.georeference.georeference import Georeference, georeference
 from boxplus.systems.slam.correction import Correction

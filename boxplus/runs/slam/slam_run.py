@@ -33,7 +33,7 @@ from boxplus.runs.slam.loop_search import LoopSearch
 from boxplus.runs.slam.result import SlamResult
 from boxplus.runs.slam.spool import ScanSpool
 from boxplus.runs.slam.summary import LEFT_IN_PLACE, SlamSummary, read_slam_summary
-from boxplus.sensors.geodesy import require_utm
+from boxplus.sensors.satellites.geodesy import require_utm
 from boxplus.systems.georeference.georeference import Georeference
 from boxplus.systems.slam.correction import Correction
 from boxplus.systems.slam.outcome import SlamOutcome

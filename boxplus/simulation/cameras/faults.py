@@ -18,8 +18,8 @@ from boxplus._settings import suggestion
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.recordings.cameras.calibration import inverse
-from boxplus.sensors.camera_image import CameraImage
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.camera_image import CameraImage
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation import faults as imu_faults
 from boxplus.simulation.cameras.scenarios import ROOM_HIGH, ROOM_LOW, CameraScenario
 from boxplus.simulation.cameras.sensor import CameraRig

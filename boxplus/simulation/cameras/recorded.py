@@ -15,8 +15,8 @@ from boxplus.recordings.cameras.info import CameraRecordingInfo, CameraStream, I
 from boxplus.recordings.info import Evidence, Topic
 from boxplus.recordings.recording import Tally
 from boxplus.residuals.inertial.imu_noise import ImuNoise
-from boxplus.sensors.camera_image import CameraImage
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.camera_image import CameraImage
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation.cameras.faults import CameraFault
 from boxplus.simulation.cameras.sensor import CameraRig
 from boxplus.simulation.cameras.simulation import DEPTH, CameraSimulation

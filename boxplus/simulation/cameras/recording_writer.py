@@ -13,8 +13,8 @@ from boxplus.formats.image_file import ImageFormat, encode_image
 from boxplus.formats.output import atomic_file, make_folder, output_error
 from boxplus.formats.trajectory_rows import tum_row
 from boxplus.manifolds import quaternion
-from boxplus.sensors.camera_image import CameraImage
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.camera_image import CameraImage
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation.bag_writer import IMU_DELAY_NS, IMU_TYPE, TRANSFORMS_TYPE, BagWriter, ground_truth_lines
 from boxplus.simulation.cameras.calibration_files import INFO_TYPE, camchain, camera_info, euroc_camera, euroc_imu
 from boxplus.simulation.cameras.faults import CameraFault

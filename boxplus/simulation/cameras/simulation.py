@@ -11,8 +11,8 @@ from pydantic import Field
 
 from boxplus._settings import Settings
 from boxplus.errors import InputError
-from boxplus.sensors.camera_image import CameraImage
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.camera_image import CameraImage
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation.cameras.exposure import ExposureCourse
 from boxplus.simulation.cameras.renderer import Renderer, Surfaces
 from boxplus.simulation.cameras.scenarios import CameraScenario, Light, make_camera_scenario

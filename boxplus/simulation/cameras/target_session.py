@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from boxplus.cameras.model import CameraModel
 from boxplus.manifolds import quaternion, se3, so3
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation.imu import ImuModel, SimulatedImu
 from boxplus.simulation.motions.spline import SplineTrajectory
 from boxplus.systems.camera_calibration.corners import TargetCorners

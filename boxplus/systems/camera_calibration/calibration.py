@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from boxplus._arguments import as_settings, require
 from boxplus.errors import BoxplusError, InputError
 from boxplus.residuals.inertial.imu_noise import ImuNoise
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.camera_calibration.adjustment import Adjustment, Rig, adjust
 from boxplus.systems.camera_calibration.config import CameraCalibrationConfig
 from boxplus.systems.camera_calibration.corners import TargetCorners

@@ -40,7 +40,7 @@ from boxplus.residuals.inertial.imu import ImuPreintegration
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
 from boxplus.residuals.prior import Prior
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.camera_calibration.adjustment import OUTLIER_SIGMAS
 from boxplus.systems.camera_calibration.corners import TargetCorners
 from boxplus.systems.camera_calibration.start import target_pose

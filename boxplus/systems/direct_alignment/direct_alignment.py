@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.optimization.losses import Huber, Loss
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_alignment.tracking import Alignment, track
 

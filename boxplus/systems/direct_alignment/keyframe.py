@@ -25,7 +25,7 @@ from boxplus._numbers import as_floats
 from boxplus.cameras.model import check_pinhole
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
-from boxplus.sensors.image import Image, as_image, half_camera
+from boxplus.sensors.images.image import Image, as_image, half_camera
 from boxplus.systems.direct_alignment.keyframe_kernel import half_depth, pixel_jacobians, select_pixels
 
 FEWEST_PIXELS = 100

@@ -26,7 +26,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds import se3
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.optimization.losses import Huber, Loss, Tukey
-from boxplus.sensors.image import Image, as_image
+from boxplus.sensors.images.image import Image, as_image
 from boxplus.systems.direct_alignment.alignment_kernel import (
     CONVERGED,
     ITERATION_LIMIT,

@@ -26,7 +26,7 @@ from boxplus.cameras.model import CameraModel, check_pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
 from boxplus.manifolds.se3 import SE3
-from boxplus.sensors.image import Image, as_image
+from boxplus.sensors.images.image import Image, as_image
 from boxplus.systems.direct_alignment.keyframe import FEWEST_PIXELS, Keyframe
 from boxplus.systems.direct_alignment.tracking import Alignment, track
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig

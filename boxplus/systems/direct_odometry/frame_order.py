@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from boxplus.errors import InputError
-from boxplus.sensors.image import Image
-from boxplus.sensors.repeated_images import RepeatedImages
+from boxplus.sensors.images.image import Image
+from boxplus.sensors.images.repeated_images import RepeatedImages
 
 
 class FrameOrder:

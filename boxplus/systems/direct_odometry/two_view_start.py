@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from boxplus._extras import require
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion, so3
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.tracking import FeatureTracker
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks

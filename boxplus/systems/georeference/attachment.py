@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import quaternion, se3
-from boxplus.sensors.geodesy import EnuFrame
-from boxplus.sensors.gnss import GnssFixes
+from boxplus.sensors.satellites.geodesy import EnuFrame
+from boxplus.sensors.satellites.gnss import GnssFixes
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.slam.graph import MapGraph
 

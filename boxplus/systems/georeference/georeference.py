@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from boxplus._arguments import as_settings
 from boxplus.errors import SingularProblemError
 from boxplus.manifolds import quaternion, se3
-from boxplus.sensors.geodesy import EnuFrame
-from boxplus.sensors.gnss import GnssFixes
+from boxplus.sensors.satellites.geodesy import EnuFrame
+from boxplus.sensors.satellites.gnss import GnssFixes
 from boxplus.systems.georeference.attachment import AttachedFixes, attach
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.georeference.doubts import NOISY, contradiction_of, doubts_of, gated_stretches, of_gated

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.geodesy import EnuFrame
+from boxplus.sensors.satellites.geodesy import EnuFrame
 from boxplus.systems.georeference.start import Start, find_start
 
 Floats = NDArray[np.float64]

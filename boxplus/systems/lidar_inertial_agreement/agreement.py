@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.sensors.gyro_attitude import GyroAttitude
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import beyond, empty, finite, glitches
-from boxplus.sensors.scan import Scan, in_order
+from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_values import beyond, empty, finite, glitches
+from boxplus.sensors.lidar.scan import Scan, in_order
 from boxplus.systems.lidar_inertial_agreement.corrected_points import CorrectedPoints, corrected_points
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import surer_path

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.sensors.downsampling import VoxelFilter
-from boxplus.sensors.gyro_attitude import GyroAttitude
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.downsampling import VoxelFilter
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import middle_of
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import plane_directions, plane_normals
 

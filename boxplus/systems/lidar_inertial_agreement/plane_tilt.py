@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.sensors.downsampling import VoxelFilter
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.downsampling import VoxelFilter
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import middle_of
 

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.nav_state import STANDARD_GRAVITY
 from boxplus.manifolds import so3
-from boxplus.sensors.gyro_attitude import GyroAttitude
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 
 _FEWEST_POSES = 6  # of a stretch

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.nav_state import BW, P, R
 from boxplus.manifolds import so3
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.sensors.downsampling import VoxelFilter
+from boxplus.sensors.lidar.downsampling import VoxelFilter
 
 # How the number of occupied cells grows as they get smaller (the box-counting dimension): 0 is single points, 2 surfaces that are
 # seen all over, and more than 2 are surfaces closer together than the cells. Cells that a scan meets, and at most so many, are

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_noise import sample_noise
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_noise import sample_noise
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 # Densities of gyroscope [rad/s/√Hz] and accelerometer [m/s²/√Hz]: of one that a motor or a gait shakes, as two real flights

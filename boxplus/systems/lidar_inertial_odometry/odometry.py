@@ -19,11 +19,11 @@ from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.sliding_box import SlidingBox
-from boxplus.sensors.deskew import deskew_into
-from boxplus.sensors.downsampling import VoxelFilter
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_saturation import Saturation
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_saturation import Saturation
+from boxplus.sensors.lidar.deskew import deskew_into
+from boxplus.sensors.lidar.downsampling import VoxelFilter
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import AFTER_GAP, BEFORE_START, Frame, Sequencer, joined_imu
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig

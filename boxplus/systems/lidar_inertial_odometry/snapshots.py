@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.maps.ikd_tree import IkdTree
-from boxplus.sensors.downsampling import VoxelFilter
+from boxplus.sensors.lidar.downsampling import VoxelFilter
 
 _OF_ITS_OWN = ("config", "map", "_voxel_filter")  # settings, and what is kept by its content
 

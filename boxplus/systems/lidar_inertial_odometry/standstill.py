@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.filtering.nav_state import T_V, TANGENT, P, V, boxplus_into
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 
 _ZERO_VELOCITY_SIGMA = 0.01  # m/s
 _MAX_DEVIATIONS = 5.0  # standard deviations of what the IMU's noise sums up to

@@ -13,7 +13,7 @@ from boxplus.filtering.map_datum import Correction
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.sensors.deskew import deskew_into
+from boxplus.sensors.lidar.deskew import deskew_into
 from boxplus.systems.lidar_odometry.motion import DOF, MotionBetween, nav_state
 
 _PARTS = 10  # of a scan; the points of one share the derivative of their motion

@@ -22,10 +22,10 @@ from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.sliding_box import SlidingBox
 from boxplus.sensors.checked import checked_imu
-from boxplus.sensors.deskew import deskew_into
-from boxplus.sensors.downsampling import VoxelFilter
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.deskew import deskew_into
+from boxplus.sensors.lidar.downsampling import VoxelFilter
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import AFTER_GAP, BEFORE_START, Sequencer
 from boxplus.systems.lidar_inertial_odometry.config import LidarOdometryConfig, LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate, Status, WeakDirection

@@ -12,8 +12,8 @@ from boxplus.errors import InputError
 from boxplus.filtering.nav_state import NavState
 from boxplus.manifolds import quaternion
 from boxplus.residuals.inertial.imu_noise import ImuNoise
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import Frame, Sequencer
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from boxplus.manifolds import quaternion
 from boxplus.residuals.inertial.imu_noise import ImuNoise
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.refinement.outside import RunFixes, RunLoops
 from boxplus.systems.slam.correction import Correction
 

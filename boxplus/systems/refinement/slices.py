@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.filtering.propagation import NODE, propagate_interval
 from boxplus.manifolds import quaternion, se3, so3
-from boxplus.sensors.deskew import deskew_into
+from boxplus.sensors.lidar.deskew import deskew_into
 from boxplus.sensors.sequencer import Frame
 
 Floats = NDArray[np.float64]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.downsampling import VoxelFilter
+from boxplus.sensors.lidar.downsampling import VoxelFilter
 
 _VOXEL_M = 0.25
 _NEIGHBOURS = 8

@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 
 _SAME_M = 1e-3  # apart, points are one
 _SHARE = 0.9  # of its points, that another LiDAR has too

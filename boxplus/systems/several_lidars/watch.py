@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.several_lidars.judgement import PairJudgement, judge_pair
 from boxplus.systems.several_lidars.motion import FEWEST_POSES, LidarMotion

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.imu_saturation import Limit
+from boxplus.sensors.inertial.imu_saturation import Limit
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.partners import FLAT, LEAST_SHARE, few_are_found
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks

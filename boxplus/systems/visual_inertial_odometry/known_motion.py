@@ -1,4 +1,4 @@
-"""Whether cameras and IMU move: images that come again (`sensors.repeated_images`) are true at rest only."""
+"""Whether cameras and IMU move: images that come again (`sensors.images.repeated_images`) are true at rest only."""
 
 from __future__ import annotations
 

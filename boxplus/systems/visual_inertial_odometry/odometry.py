@@ -21,16 +21,16 @@ from boxplus._arguments import as_settings, shown
 from boxplus._extras import require
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, so3
-from boxplus.sensors.camera_image import CameraImage
 from boxplus.sensors.checked import checked_imu
-from boxplus.sensors.eight_bits import EightBits
-from boxplus.sensors.glitch_filter import GlitchFilter
-from boxplus.sensors.gyro_attitude import GyroAttitude
-from boxplus.sensors.image_instants import ImageInstants
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_saturation import Limit, Saturation
-from boxplus.sensors.imu_values import measurements
-from boxplus.sensors.repeated_images import RepeatedImages
+from boxplus.sensors.images.camera_image import CameraImage
+from boxplus.sensors.images.eight_bits import EightBits
+from boxplus.sensors.images.image_instants import ImageInstants
+from boxplus.sensors.images.repeated_images import RepeatedImages
+from boxplus.sensors.inertial.glitch_filter import GlitchFilter
+from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_saturation import Limit, Saturation
+from boxplus.sensors.inertial.imu_values import measurements
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.tracking import FeatureTracker, Tracker
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks

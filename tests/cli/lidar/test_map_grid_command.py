@@ -16,7 +16,7 @@ from boxplus._extras import installation
 from boxplus.cli import app
 from boxplus.formats.trajectory_writer import TrajectoryWriter
 from boxplus.maps.tiles.writer import TileWriter
-from boxplus.sensors.geodesy import EnuFrame
+from boxplus.sensors.satellites.geodesy import EnuFrame
 
 
 def run_folder(folder: Path, z_of_second_lap: float = 0.0) -> Path:

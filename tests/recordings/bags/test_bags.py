@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from boxplus.errors import AmbiguityError, RecordingError
 from boxplus.recordings import RecordingOptions, open_recording
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from tests.bags import CONTAINERS, LAYOUTS, PERIOD_NS, START_NS, Content, write_bag
 
 

@@ -15,7 +15,7 @@ from rosbags.rosbag1 import reader as ros1_module
 from boxplus.errors import RecordingError
 from boxplus.recordings import open_recording
 from boxplus.recordings.bags import bounded_readers, inflation
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from tests.bags import Content, write_bag
 from tests.recordings.bags.test_inflation import KINDS, LIMIT, SMALL, compressor, hiding_a_bomb, write_compressed
 

@@ -14,7 +14,7 @@ from boxplus.cli import app
 from boxplus.errors import RecordingError
 from boxplus.recordings import Recording, open_recording
 from boxplus.runs.inspection.diagnosis import diagnose
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from tests.bags import CONTAINERS, Content, write_bag
 
 CONTENT = Content(scans=12, points=60, imu_rate=50)

@@ -16,7 +16,7 @@ from boxplus.errors import RecordingError
 from boxplus.recordings import open_recording
 from boxplus.recordings.bags import inflation
 from boxplus.recordings.bags.container import DamagedRecordError, foreign_errors
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from tests.bags import Content, write_bag
 
 SMALL, LARGE = (Content(points=points, scans=8, imu_rate=50) for points in (4_000, 20_000))  # chunks of MCAP hold 1 MB

@@ -11,7 +11,7 @@ from boxplus.errors import RecordingError
 from boxplus.recordings import RecordingOptions, open_recording
 from boxplus.recordings.bags.parts import bag_files, recordings_among
 from boxplus.runs.fleet.recordings import find_recordings, holds_recordings
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from tests.bags import PERIOD_NS, Container, Content, write_bag
 
 

@@ -10,7 +10,7 @@ import pytest
 from boxplus.errors import RecordingError
 from boxplus.manifolds import so3
 from boxplus.recordings.cameras.open import has_cameras_only, open_camera_recording
-from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.images.camera_image import CameraImage
 
 START = np.datetime64("2011-09-26T13:02:25.100000000", "ns")
 RNG = np.random.default_rng(0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from boxplus.runs.cameras.turning import Turning
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -27,7 +27,7 @@ from boxplus.runs.direct.frame_log import read_frame_log
 from boxplus.runs.direct.frame_pairs import FramePairs, choose_cameras
 from boxplus.runs.direct.summary import read_direct_summary
 from boxplus.runs.settings_file import load_settings
-from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.images.camera_image import CameraImage
 from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, make_rig, simulate_cameras, write_camera_recording
 from tests.report.unpacked import figures_of
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room, drive, errors

@@ -17,7 +17,7 @@ from boxplus.recordings import Evidence, RecordingOptions
 from boxplus.recordings.stream_checks import check_rate
 from boxplus.runs.inspection.diagnosis import Diagnosis, diagnose
 from boxplus.runs.inspection.imu_checks import check_rest, check_saturation, first_second, quiet_stretch
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
 from tests.bags import PERIOD_NS, START_NS, Content, write_bag
 
@@ -273,7 +273,7 @@ def test_command_exits_with_one_on_errors(tmp_path: Path, app: typer.Typer) -> N
 )
 def test_shared_recordings(shared_data: Path, name: str, scans: int, imu_samples: int, unit: str, accel_unit: str) -> None:
     from boxplus.recordings import open_recording
-    from boxplus.sensors.scan import Scan
+    from boxplus.sensors.lidar.scan import Scan
 
     with open_recording(shared_data / "recordings" / name) as recording:
         events = list(recording)

@@ -7,9 +7,9 @@ import pytest
 
 from boxplus.recordings.info import Evidence
 from boxplus.runs.inspection.gnss_checks import check_gnss, check_receivers
-from boxplus.sensors.geodesy import EnuFrame
-from boxplus.sensors.gnss import GnssFixes
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.satellites.geodesy import EnuFrame
+from boxplus.sensors.satellites.gnss import GnssFixes
 from boxplus.simulation.gnss import GnssConfig, simulate_gnss
 
 ORIGIN = EnuFrame(49.0, 8.4, 115.0)

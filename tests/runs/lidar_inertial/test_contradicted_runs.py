@@ -16,7 +16,7 @@ from boxplus.recordings.options import RecordingOptions
 from boxplus.runs.lidar_inertial.config import MapConfig, RunConfig
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.lidar_inertial.summary import RunSummary
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar, faults, mounting, write_recording
 from boxplus.simulation.live_recording import as_recording
 from boxplus.simulation.motions import manoeuvres

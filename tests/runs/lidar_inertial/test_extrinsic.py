@@ -19,7 +19,7 @@ from boxplus.recordings.recording import Event, Recording
 from boxplus.runs.lidar_inertial.config import MapConfig, RunConfig
 from boxplus.runs.lidar_inertial.extrinsic import Extrinsic, choose_extrinsic
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Simulation, SpinningLidar, make_scenario, simulate
 from boxplus.simulation.faults import Fault, flip_gyro
 from boxplus.simulation.live_recording import as_recording

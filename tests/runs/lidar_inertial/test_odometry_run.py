@@ -33,8 +33,8 @@ from boxplus.runs.lidar_inertial.scan_log import SHARES, read_scan_log
 from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.run_loop import Progress
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import BEFORE_START
 from boxplus.simulation import Fault, SpinningLidar, simulate
 from boxplus.simulation.live_recording import as_recording

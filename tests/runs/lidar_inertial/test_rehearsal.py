@@ -15,8 +15,8 @@ from boxplus.recordings.recording import Recording
 from boxplus.runs.lidar_inertial.extrinsic import choose_extrinsic
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.lidar_inertial.rehearsal import rehearse
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Simulation, SpinningLidar, make_scenario, simulate
 from boxplus.simulation.live_recording import as_recording
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig

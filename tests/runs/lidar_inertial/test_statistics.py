@@ -15,8 +15,8 @@ from boxplus.manifolds import so3
 from boxplus.runs.lidar_inertial.config import MapConfig, RunConfig
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.lidar_inertial.statistics import RunStatistics
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Fault, Scenario, Simulation, SpinningLidar, simulate
 from boxplus.simulation.faults import Event, nan_burst
 from boxplus.simulation.live_recording import as_recording

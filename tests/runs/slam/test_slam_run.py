@@ -34,7 +34,7 @@ from boxplus.runs.slam.result import SlamResult, load_slam_result
 from boxplus.runs.slam.slam_run import doubt_of_odometry, run_slam
 from boxplus.runs.slam.spool import ScanSpool, SpooledScan, read_spool
 from boxplus.runs.slam.summary import GnssFacts
-from boxplus.sensors.geodesy import EnuFrame, to_utm
+from boxplus.sensors.satellites.geodesy import EnuFrame, to_utm
 from boxplus.simulation import SpinningLidar
 from boxplus.simulation.gnss import GnssConfig
 from boxplus.simulation.live_recording import GNSS_ORIGIN, as_recording

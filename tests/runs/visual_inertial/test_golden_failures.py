@@ -19,8 +19,8 @@ from boxplus.formats.trajectory import Trajectory, read_trajectory
 from boxplus.manifolds import quaternion, so3
 from boxplus.runs.visual_inertial.config import VioRunConfig
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
-from boxplus.sensors.camera_image import CameraImage
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.camera_image import CameraImage
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation.cameras import CameraFault, as_camera_recording, faults, make_rig, simulate_cameras
 from boxplus.simulation.cameras.sensor import CameraRig
 

@@ -35,8 +35,8 @@ from boxplus.runs.visual_inertial.frame_log import read_frame_log
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
 from boxplus.runs.visual_inertial.summary import LengthFacts, VioSummary, read_vio_summary
 from boxplus.runs.visual_inertial.visual_run import run_visual_odometry
-from boxplus.sensors.camera_image import CameraImage
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.camera_image import CameraImage
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, make_rig, simulate_cameras, write_camera_recording
 from boxplus.simulation.cameras.faults import CameraFault, covered_lens
 from boxplus.systems.visual_inertial_odometry import VioConfig, VioEstimate

@@ -17,8 +17,8 @@ from boxplus.recordings.cameras.decode import decode_file
 from boxplus.recordings.cameras.events import CameraRecording
 from boxplus.recordings.cameras.open import open_camera_recording
 from boxplus.recordings.cameras.options import CameraRecordingOptions
-from boxplus.sensors.camera_image import CameraImage
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.camera_image import CameraImage
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation import ImuModel
 from boxplus.simulation.cameras import (
     CAMERA_FAULTS,

@@ -16,7 +16,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds.body_pose import BodyPose
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.runs.camera_calibration.summary import ImuFacts, imu_facts
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation.cameras.target_session import TargetSession
 from boxplus.simulation.imu import ImuModel
 from boxplus.systems.camera_calibration import imu as imu_part

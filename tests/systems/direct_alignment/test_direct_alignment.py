@@ -15,7 +15,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
 from boxplus.optimization.losses import Squared, UserLoss
 from boxplus.residuals.camera.photometric import Photometric
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_alignment.direct_alignment import align_rgbd
 from tests.systems.direct_alignment.stereo_depth import stereo_depth
 

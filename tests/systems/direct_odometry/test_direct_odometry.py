@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig
 from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry

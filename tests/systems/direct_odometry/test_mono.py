@@ -10,7 +10,7 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.evaluation.alignment import align
 from boxplus.manifolds import quaternion, se3, so3
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.simulation.cameras import make_rig, simulate_cameras
 from boxplus.systems.direct_odometry import direct_odometry
 from boxplus.systems.direct_odometry.config import DirectOdometryConfig

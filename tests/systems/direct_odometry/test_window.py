@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
 from boxplus.residuals.camera.photometric import DSO_PATTERN
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth
 from boxplus.systems.direct_odometry.patches import choose_patches

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.manifolds import se3
-from boxplus.sensors.geodesy import EnuFrame
-from boxplus.sensors.gnss import GnssFixes
+from boxplus.sensors.satellites.geodesy import EnuFrame
+from boxplus.sensors.satellites.gnss import GnssFixes
 from boxplus.simulation.drifting_drive import DriftConfig, simulate_drift
 from boxplus.simulation.gnss import GnssConfig, simulate_gnss
 from boxplus.systems.georeference.georeference import Georeference

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from boxplus.errors import SingularProblemError
 from boxplus.manifolds import quaternion, se3
-from boxplus.sensors.gnss import GnssFixes
+from boxplus.sensors.satellites.gnss import GnssFixes
 from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.gnss import GnssConfig
 from boxplus.systems.georeference.attachment import AttachedFixes, attach

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from boxplus.sensors.gnss import GnssFixes
+from boxplus.sensors.satellites.gnss import GnssFixes
 from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.gnss import GnssConfig
 from boxplus.systems.georeference.georeference import Georeference, georeference

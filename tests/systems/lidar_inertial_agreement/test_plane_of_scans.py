@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.motions.spline import Trajectory

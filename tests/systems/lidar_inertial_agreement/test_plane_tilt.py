@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar, faults, mounting
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import sites, worlds

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from boxplus.filtering.nav_state import STANDARD_GRAVITY
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, few_groups, wide_prior
 from tests.systems.lidar_inertial_agreement.lidar_path.test_explained_scans import true_path

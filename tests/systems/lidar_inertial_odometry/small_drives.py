@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from boxplus.sensors.downsampling import VoxelFilter
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.downsampling import VoxelFilter
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import Frame, Sequencer
 from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation, SpinningLidar, simulate
 from boxplus.simulation.motions import trajectories

@@ -12,8 +12,8 @@ import pytest
 from boxplus.errors import InputError
 from boxplus.recordings.open import open_recording
 from boxplus.runs.inspection.diagnosis import diagnose
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Fault, ImuModel, Scenario, SpinningLidar, faults, simulate, write_recording
 from boxplus.simulation.faults import Event
 from boxplus.simulation.motions import trajectories

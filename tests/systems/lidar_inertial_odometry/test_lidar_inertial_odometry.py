@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from boxplus.errors import InputError
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.simulation import Simulation
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig

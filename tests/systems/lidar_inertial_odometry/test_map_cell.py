@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from boxplus.manifolds import so3
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.sensors.downsampling import VoxelFilter
+from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.systems.lidar_inertial_odometry.map_cell import map_cell_for
 
 CONFIG = RegistrationConfig()

@@ -12,7 +12,7 @@ import pytest
 
 from boxplus.evaluation.nees import nees, nees_band
 from boxplus.manifolds import so3
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import ImuModel, simulate
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate

@@ -3,7 +3,7 @@
 import numpy as np
 
 from boxplus.manifolds import so3
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import simulate
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry

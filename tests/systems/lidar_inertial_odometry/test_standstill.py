@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from boxplus.filtering.nav_state import T_V, TANGENT, NavState, P, V
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 
 RATE_HZ = 200.0

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boxplus.manifolds import so3
-from boxplus.sensors.deskew import deskew_into
+from boxplus.sensors.lidar.deskew import deskew_into
 from boxplus.systems.lidar_odometry.motion import DOF, MotionBetween, MotionState, joint_prior, nav_state
 
 seeds = st.integers(0, 2**32 - 1)

@@ -11,7 +11,7 @@ import pytest
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.runs.storage.state_codec import read_state, write_state
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Simulation, SpinningLidar, simulate
 from boxplus.systems.lidar_inertial_odometry.config import LidarOdometryConfig, LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate

@@ -11,7 +11,7 @@ import pytest
 from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Simulation
 from boxplus.simulation.lidar import SpinningLidar
 from boxplus.simulation.motions.manoeuvres import constant_velocity, level

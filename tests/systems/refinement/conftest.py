@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import quaternion
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Simulation, SpinningLidar, make_scenario
 from boxplus.simulation.motions import manoeuvres
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig

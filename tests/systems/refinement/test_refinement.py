@@ -12,7 +12,7 @@ from boxplus.errors import InputError
 from boxplus.evaluation.nees import nees
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.maps.plane_voxels.thickness import Sharpness
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.refinement.collecting import OdometryRows, collect
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.keyframes import choose_keyframes

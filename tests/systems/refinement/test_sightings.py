@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.residuals.inertial.imu_noise import ImuNoise
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.keyframes import Keyframes

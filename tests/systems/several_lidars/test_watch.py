@@ -10,7 +10,7 @@ import pytest
 
 from boxplus.filtering.nav_state import NavState
 from boxplus.manifolds import so3
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Fault, MountedLidar, RosetteLidar, Simulation, SpinningLidar, as_recording, faults
 from boxplus.simulation.motions import trajectories
 from boxplus.simulation.scenarios import Scenario

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from boxplus import CameraImage
-from boxplus.sensors.repeated_images import RepeatedImages
+from boxplus.sensors.images.repeated_images import RepeatedImages
 from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig, VioEstimate, VisualInertialOdometry
 from boxplus.systems.visual_inertial_odometry.known_motion import imu_moves, is_motion

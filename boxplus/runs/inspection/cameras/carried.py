@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 
 Floats = NDArray[np.float64]
 

@@ -21,8 +21,8 @@ from boxplus.runs.inspection.cameras.readout import check_readout
 from boxplus.runs.inspection.cameras.rotation import Turns, align, check_rotation, measured_turns
 from boxplus.runs.inspection.cameras.stereo import Corners, check_baseline, check_calibration
 from boxplus.runs.inspection.cameras.tracking import Turned, follow, rotation_between
-from boxplus.sensors.camera_image import CameraImage
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.camera_image import CameraImage
+from boxplus.sensors.inertial.imu import ImuSamples
 
 _STEREO_PAIRS = 12
 _MOST_TURNS, _MOST_STILL = 240, 2000  # pairs of images in which the camera moves, and rests

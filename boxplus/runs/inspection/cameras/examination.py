@@ -14,8 +14,8 @@ from boxplus.runs.inspection.cameras.comparison import Comparison
 from boxplus.runs.inspection.cameras.stereo import check_synchronisation
 from boxplus.runs.inspection.cameras.views import GAP_FACTOR, Views, check_blur, check_corners, check_views
 from boxplus.runs.inspection.imu_checks import check_saturation, check_values
-from boxplus.sensors.eight_bits import EightBits
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.eight_bits import EightBits
+from boxplus.sensors.inertial.imu import ImuSamples
 
 _SLOW_IMU_HZ = 50.0
 

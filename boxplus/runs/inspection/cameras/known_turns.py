@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.runs.inspection.cameras.rotation import Alignment, Turns
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 
 Floats = NDArray[np.float64]
 

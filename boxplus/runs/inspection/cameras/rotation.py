@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from boxplus.manifolds.nearest_rotation import nearest_rotation
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence, Verdict
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_saturation import limits_of
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_saturation import limits_of
 
 _SEARCH_S = 0.15
 _STEP_S = 0.001

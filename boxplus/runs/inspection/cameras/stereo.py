@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from boxplus.recordings.cameras.calibration import inverse
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.recordings.info import Evidence
-from boxplus.sensors.image_instants import TOGETHER_NS
+from boxplus.sensors.images.image_instants import TOGETHER_NS
 
 Floats = NDArray[np.float64]
 

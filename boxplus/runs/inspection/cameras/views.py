@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.recordings.info import Evidence, Verdict
-from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.images.camera_image import CameraImage
 
 GAP_FACTOR = 1.5
 """Times the usual interval between images, from which on some are missing."""

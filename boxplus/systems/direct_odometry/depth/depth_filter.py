@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion, se3
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_odometry.depth.epipolar_kernel import DIFFERENT, FOUND
 from boxplus.systems.direct_odometry.depth.epipolar_search import View, choose_candidates, search
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth

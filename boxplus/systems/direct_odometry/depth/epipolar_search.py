@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion
-from boxplus.sensors.image import Image, half_camera
+from boxplus.sensors.images.image import Image, half_camera
 from boxplus.systems.direct_alignment.keyframe_kernel import select_pixels
 from boxplus.systems.direct_odometry.depth.epipolar_kernel import FOUND, OUTSIDE, search_lines
 

@@ -11,7 +11,7 @@ from boxplus.cameras.model import CameraModel, check_pinhole
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds.se3 import SE3Left
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_odometry.depth.agreement import agreed
 from boxplus.systems.direct_odometry.depth.epipolar_kernel import FOUND
 from boxplus.systems.direct_odometry.depth.epipolar_search import View, cell_size, choose_candidates, search

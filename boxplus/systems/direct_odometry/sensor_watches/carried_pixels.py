@@ -17,7 +17,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from boxplus._jit import kernel
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_alignment.keyframe import image_noise
 
 Floats = NDArray[np.float32]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 
 Matrix = NDArray[np.float64]
 _WIDTH = 160  # of the octave, at least this and less than twice it

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import se3
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_alignment.tracking import Alignment
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair
 from boxplus.systems.direct_odometry.sensor_watches.calibration_watch import CalibrationWatch, Depths

@@ -24,7 +24,7 @@ from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import quaternion
 from boxplus.manifolds.se3 import SE3Left
 from boxplus.residuals.camera.photometric_sampling import sample
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair
 from boxplus.systems.direct_odometry.sensor_watches.leftover import Combined
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import (
     one_motion,
     other_explains_better,

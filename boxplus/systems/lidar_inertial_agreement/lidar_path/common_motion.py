@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from boxplus._words import signed
 from boxplus.manifolds import so3
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import ChangedPoints, changed_points
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.sensors.downsampling import VoxelFilter
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.downsampling import VoxelFilter
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import explains_changes
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Poses, Twist

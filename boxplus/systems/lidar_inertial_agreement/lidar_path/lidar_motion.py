@@ -21,8 +21,8 @@ from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import REASONS, PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.sensors.downsampling import VoxelFilter
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.downsampling import VoxelFilter
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import (
     FEWEST_USED,
     GOOD_MISFIT_M,

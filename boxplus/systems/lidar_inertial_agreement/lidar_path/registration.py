@@ -13,9 +13,9 @@ from boxplus.filtering.propagation import N_P, N_R, N_TIME, N_V, N_W, NODE
 from boxplus.manifolds import so3
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.sensors.deskew import deskew_into
-from boxplus.sensors.downsampling import VoxelFilter
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.deskew import deskew_into
+from boxplus.sensors.lidar.downsampling import VoxelFilter
+from boxplus.sensors.lidar.scan import Scan
 
 GOOD_MISFIT_M = 0.06  # of a registration that needs no second start
 FEWEST_USED = 60  # points on planes, or a scan is not registered

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
-from boxplus.sensors.gyro_attitude import GyroAttitude
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 
 KNOWN_RAD = 0.02  # standard deviation of an attitude that is known

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.nav_state import NavState
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import Frame, joined_imu
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath

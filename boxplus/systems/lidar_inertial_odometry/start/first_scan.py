@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.filtering.propagation import NODE, propagate_interval
-from boxplus.sensors.deskew import deskew_into
+from boxplus.sensors.lidar.deskew import deskew_into
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 

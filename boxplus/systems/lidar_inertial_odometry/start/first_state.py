@@ -21,7 +21,7 @@ from boxplus.filtering.nav_state import (
 )
 from boxplus.manifolds import so3
 from boxplus.manifolds.upright_rotation import upright_rotation
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 
 _SHORTEST, _LONGEST = 0.05, 1.5  # of the time between scans
 _LONGEST_PERIOD_S = 1.0  # beyond it scans are missing

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from boxplus._words import signed
 from boxplus.errors import InputError
 from boxplus.filtering.nav_state import T_V, NavState
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import speaks_against

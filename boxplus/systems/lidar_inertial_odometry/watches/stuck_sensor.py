@@ -14,7 +14,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 
 _STUCK_S, _FEWEST = 0.5, 10  # over which, and how many samples, all three axes repeat themselves
 _BEFORE = 4  # samples before, of a turn that lasted

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from boxplus._extras import require
 from boxplus._jit import kernel
 from boxplus.manifolds import so3
-from boxplus.sensors.eight_bits import EightBits
+from boxplus.sensors.images.eight_bits import EightBits
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.carried import CARRIED, CarriedCorners
 from boxplus.systems.visual_inertial_odometry.corners.centres import centred

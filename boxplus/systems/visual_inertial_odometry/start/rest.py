@@ -9,7 +9,7 @@ import numpy as np
 
 from boxplus.manifolds import so3
 from boxplus.residuals.inertial.imu_noise import ImuNoise
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks, shared_rows
 from boxplus.systems.visual_inertial_odometry.start.ray_tracks import Floats
 

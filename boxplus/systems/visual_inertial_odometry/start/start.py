@@ -26,8 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 from boxplus.manifolds import quaternion, so3, sphere
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_noise import sample_noise
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_noise import sample_noise
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.partners import swapped
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks

@@ -18,7 +18,7 @@ from boxplus.cli import app
 from boxplus.recordings import CameraStream
 from boxplus.recordings.info import Evidence
 from boxplus.runs.inspection.cameras.rotation import Turns, align, check_rotation
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from tests.camera_recordings import FRAME_NS, START_NS, CameraBag, pgm, write_euroc
 
 needs_cv2 = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="OpenCV (extra `vision`) is not installed")

@@ -23,8 +23,8 @@ from boxplus.runs.inspection.cameras.readout import check_readout, estimate_read
 from boxplus.runs.inspection.cameras.rotation import Turns, align, measured_turns
 from boxplus.runs.inspection.cameras.stereo import Corners, check_calibration
 from boxplus.runs.inspection.cameras.views import Views, check_blur, check_corners, check_views
-from boxplus.sensors.camera_image import CameraImage
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.images.camera_image import CameraImage
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation.cameras import CameraSimulation, as_camera_recording, make_camera_fault, make_rig, simulate_cameras
 from boxplus.simulation.cameras.sensor import CameraRig, LensKind
 

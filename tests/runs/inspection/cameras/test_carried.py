@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.runs.inspection.cameras.carried import Followed, check_carried
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.simulation.cameras import as_camera_recording, make_rig, simulate_cameras
 
 SIMULATION = simulate_cameras("room_moving", 4, duration_s=6.0, rig=make_rig("mono", None, 0.5, 20.0))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boxplus.manifolds import se3
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_odometry.depth.depth_filter import DepthFilter, depth_from, depth_of_two
 from boxplus.systems.direct_odometry.depth.epipolar_search import pixels_per_inverse_depth
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth

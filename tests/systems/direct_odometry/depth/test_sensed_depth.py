@@ -9,7 +9,7 @@ from boxplus.cameras.distortion import RadialTangential
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair, rgbd_depth
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room
 

@@ -11,7 +11,7 @@ from boxplus.cameras.distortion import RadialTangential
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3, so3
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_alignment.tracking import track
 from boxplus.systems.direct_odometry.depth.sensed_depth import SensedDepth, StereoPair, rgbd_depth
 from boxplus.systems.direct_odometry.direct_odometry import DirectOdometry

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_alignment.keyframe import Keyframe
 from boxplus.systems.direct_alignment.tracking import track
 from boxplus.systems.direct_odometry.depth.sensed_depth import rgbd_depth

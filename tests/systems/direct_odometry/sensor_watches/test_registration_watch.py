@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_odometry.sensor_watches.registration_watch import RegistrationWatch
 
 SHAPE = (240, 320)

@@ -10,7 +10,7 @@ import pytest
 from boxplus.cameras.distortion import RadialTangential
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.manifolds import se3
-from boxplus.sensors.image import Image
+from boxplus.sensors.images.image import Image
 from boxplus.systems.direct_odometry.depth.sensed_depth import StereoPair
 from boxplus.systems.direct_odometry.sensor_watches.stereo_watch import StereoWatch
 from tests.systems.direct_odometry.scenes import CAMERA, SHAPE, Room

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation, SpinningLidar
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import sites

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar
 from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import sites

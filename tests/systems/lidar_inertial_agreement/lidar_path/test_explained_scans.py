@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation, SpinningLidar
 from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import worlds

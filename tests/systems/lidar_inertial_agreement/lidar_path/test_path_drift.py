@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for, with_cells_for_all
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG
 

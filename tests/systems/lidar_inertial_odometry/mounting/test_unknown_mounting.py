@@ -12,7 +12,7 @@ from boxplus.filtering.iterated_update import Information, iterated_update
 from boxplus.filtering.map_datum import SHARED_ERRORS
 from boxplus.filtering.nav_state import PL, RL, TANGENT, G, NavState, P, R
 from boxplus.manifolds import so3
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, mounting
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import worlds

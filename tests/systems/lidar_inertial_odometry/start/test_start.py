@@ -13,8 +13,8 @@ import pytest
 
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, simulate
 from boxplus.simulation.faults import flip_accel

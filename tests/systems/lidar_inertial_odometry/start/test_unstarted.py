@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation.faults import wrong_time_unit
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_odometry.start import unstarted as unstarted_module

@@ -11,7 +11,7 @@ import pytest
 
 from boxplus.filtering.nav_state import BA, BW, T_P, TANGENT, NavState, P, V
 from boxplus.manifolds import so3
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import first_sensitivity
 from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import quaternion
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.start.search import StartSearch

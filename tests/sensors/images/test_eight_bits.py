@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from boxplus.sensors.eight_bits import EightBits
+from boxplus.sensors.images.eight_bits import EightBits
 
 
 def test_eight_bits_stay_and_sixteen_lose_their_lower_half() -> None:

@@ -6,8 +6,8 @@ from collections import Counter
 
 import numpy as np
 
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import BEFORE, EMPTY, GLITCH, empty, glitches
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_values import BEFORE, EMPTY, GLITCH, empty, glitches
 
 _CONTEXT = BEFORE + 2  # samples: the ends of the steps that tell what is usual, and the one that may wait
 

@@ -11,7 +11,7 @@ from boxplus.cameras.distortion import Radial
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.residuals.camera.photometric_sampling import sample
-from boxplus.sensors.image import Image, half_camera
+from boxplus.sensors.images.image import Image, half_camera
 
 
 def test_half_is_the_mean_of_two_by_two() -> None:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from boxplus import CameraImage
-from boxplus.sensors.image_instants import TOGETHER_NS, ImageInstants
+from boxplus.sensors.images.image_instants import TOGETHER_NS, ImageInstants
 
 PERIOD_NS = 5_000_000
 

@@ -6,10 +6,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from boxplus.sensors.glitch_filter import GlitchFilter
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import EMPTY, GLITCH
-from tests.sensors.test_imu_values import moving
+from boxplus.sensors.inertial.glitch_filter import GlitchFilter
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_values import EMPTY, GLITCH
+from tests.sensors.inertial.test_imu_values import moving
 
 
 @given(st.integers(0, 10_000), st.lists(st.integers(12, 57), max_size=4), st.lists(st.integers(0, 60), max_size=8))

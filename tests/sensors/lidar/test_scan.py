@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from boxplus.errors import InputError
-from boxplus.sensors.scan import Scan, in_order
+from boxplus.sensors.lidar.scan import Scan, in_order
 
 coordinates = st.one_of(st.floats(width=32), st.just(0.0))
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boxplus.errors import InputError
-from boxplus.sensors.downsampling import VoxelFilter
+from boxplus.sensors.lidar.downsampling import VoxelFilter
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_noise import sample_noise
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_noise import sample_noise
 
 
 @given(st.sampled_from((50.0, 200.0, 1000.0)), st.floats(1e-5, 1e-1), st.integers(0, 1000))

@@ -151,7 +151,7 @@ def in_order(scans: Iterable[Scan]) -> list[Scan]:
     """The scans that end after all before them: what is recorded twice, or comes late, is left out.
 
     Example:
-        >>> from boxplus.sensors.scan import in_order
+        >>> from boxplus.sensors.lidar.scan import in_order
         >>> first = bp.Scan.from_arrays([[4.0, 1.0, 0.2]], [1_000_000_000])
         >>> len(in_order([first, first, first.shifted(100_000_000)]))
         2

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 
 NOT_FINITE, BEYOND = "IMU sample not finite", "IMU sample beyond any sensor"
 EMPTY, GLITCH = "IMU sample of zeros", "IMU sample unlike both of its neighbours"

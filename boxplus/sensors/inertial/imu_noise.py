@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 
 # White noise of variance σ² makes second differences of variance (1 + 4 + 1) σ²; a body in motion, hardly any.
 _SECOND_DIFFERENCE = 6.0

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boxplus.manifolds import so3
-from boxplus.sensors.scan import Scan
-from boxplus.sensors.scan_merger import ScanMerger
+from boxplus.sensors.lidar.scan import Scan
+from boxplus.sensors.lidar.scan_merger import ScanMerger
 
 MS = 1_000_000
 START_NS = 1_700_000_000 * 10**9

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.filtering.propagation import N_A, N_P, N_R, N_TIME, N_V, N_W, NODE, propagate_interval
 from boxplus.manifolds import so3
-from boxplus.sensors.deskew import deskew_into
+from boxplus.sensors.lidar.deskew import deskew_into
 from boxplus.simulation import ImuModel, SpinningLidar, simulate
 
 seeds = st.integers(0, 2**32 - 1)

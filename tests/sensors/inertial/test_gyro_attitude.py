@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from boxplus.sensors.gyro_attitude import GyroAttitude
+from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
 
 
 def test_attitude_is_the_integral_of_the_rate() -> None:

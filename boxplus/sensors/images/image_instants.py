@@ -10,7 +10,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from boxplus.sensors.camera_image import CameraImage
+from boxplus.sensors.images.camera_image import CameraImage
 
 TOGETHER_NS = 1_000_000
 """Images of several cameras whose stamps differ by no more belong together [ns]: a turn of 1 rad/s moves corners by half a pixel

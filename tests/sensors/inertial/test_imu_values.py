@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_values import EMPTY, GLITCH, beyond, empty, finite, glitches
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_values import EMPTY, GLITCH, beyond, empty, finite, glitches
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import Sequencer
 
 rates = st.sampled_from([50.0, 100.0, 200.0, 400.0, 1000.0])

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from boxplus.errors import InputError
-from boxplus.sensors.geodesy import EnuFrame, ecef_to_geodetic, geodetic_to_ecef, to_utm, utm_epsg
-from boxplus.sensors.gnss import GnssFixes, antenna_offset
+from boxplus.sensors.satellites.geodesy import EnuFrame, ecef_to_geodetic, geodetic_to_ecef, to_utm, utm_epsg
+from boxplus.sensors.satellites.gnss import GnssFixes, antenna_offset
 
 EVERYWHERE = (st.floats(-90.0, 90.0), st.floats(-180.0, 180.0), st.floats(-5000.0, 50_000.0))
 

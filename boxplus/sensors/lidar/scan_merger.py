@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.scan import Scan
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.time_steps import TimeSteps
 
 _LONGEST_LEAD_NS = 200_000_000  # before the scan that takes them in, where no scan came before

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from boxplus.sensors.imu import ImuSamples
-from boxplus.sensors.imu_saturation import Saturation, limits_of
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.inertial.imu_saturation import Saturation, limits_of
 
 STEP = 0.0081722  # m/s², of the accelerometer that the values below are from
 SCAN = 20  # samples

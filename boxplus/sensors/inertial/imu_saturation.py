@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.sensors.imu import ImuSamples
+from boxplus.sensors.inertial.imu import ImuSamples
 
 _MEMORY = 20  # blocks
 _BLOCK_NS = 100_000_000  # of samples that are looked at as a whole
