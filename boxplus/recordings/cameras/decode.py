@@ -1,4 +1,4 @@
-"""Images from their bytes: raw, Bayer mosaics, PGM and PPM without help; JPEG, PNG and demosaicing through OpenCV.
+"""Images from their bytes: raw, PGM and PPM without help; JPEG, PNG and demosaicing through OpenCV.
 
 What decoders pass over in silence is checked here: libjpeg paints the missing rest of a cut image grey, so a JPEG must hold
 its end marker behind its last scan, and every chunk of a PNG its checksum. Damage inside of a JPEG's entropy code shows in
@@ -36,11 +36,24 @@ _RAW: dict[str, tuple[str, int, tuple[int, ...] | None]] = {
     "bgr8": ("u1", 3, (2, 1, 0)),
     "rgba8": ("u1", 4, (0, 1, 2)),
     "bgra8": ("u1", 4, (2, 1, 0)),
+    "rgb16": ("u2", 3, (0, 1, 2)),
+    "bgr16": ("u2", 3, (2, 1, 0)),
+    "rgba16": ("u2", 4, (0, 1, 2)),
+    "bgra16": ("u2", 4, (2, 1, 0)),
+    "yuv422": ("u1", 2, (1,)),
+    "uyvy": ("u1", 2, (1,)),
+    "yuv422_yuy2": ("u1", 2, (0,)),
+    "yuyv": ("u1", 2, (0,)),
 }
-"""Type, channels, and which of them are red, green, blue, by the encodings of sensor_msgs/image_encodings.h."""
+"""Type, channels, and which of them are red, green, blue, or the luminance alone, by the encodings of
+sensor_msgs/image_encodings.h."""
 
 # OpenCV names a mosaic by the second row's second and third pixel, ROS by the first row's first two and the one below.
-_BAYER = {"bayer_rggb8": "BG", "bayer_bggr8": "RG", "bayer_gbrg8": "GR", "bayer_grbg8": "GB"}
+_BAYER = {
+    f"bayer_{pattern}{bits}": code
+    for pattern, code in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB"))
+    for bits in (8, 16)
+}
 
 ENCODINGS = (*_RAW, *_BAYER)
 DEPTH_ENCODINGS = {"16UC1": 1e-3, "32FC1": 1.0}
@@ -59,13 +72,15 @@ def needs_opencv(data: bytes) -> bool:
 def decode_raw(encoding: str, height: int, width: int, step: int, big_endian: bool, data: bytes | memoryview) -> Pixels:
     """The pixels of a raw image: (H, W) or (H, W, 3) in the order red, green, blue; Bayer mosaics are interpolated.
 
+    Of luminance and chrominance (YUV 4:2:2) the luminance is taken.
+
     Raises:
         MalformedImageError: an unknown encoding, or sizes that do not match.
         RecordingError: a Bayer mosaic, and OpenCV is not installed.
     """
     if encoding not in ENCODINGS:
         raise MalformedImageError(f"unknown encoding {encoding!r}, where {', '.join(ENCODINGS)} are read")
-    kind, channels, order = _RAW.get(encoding, ("u1", 1, None))
+    kind, channels, order = _RAW.get(encoding, ("u2" if encoding.endswith("16") else "u1", 1, None))
     dtype = np.dtype(kind).newbyteorder(">" if big_endian else "<")
     row = width * channels * dtype.itemsize
     if not (0 < height <= _LARGEST_SIDE and 0 < width <= _LARGEST_SIDE):
@@ -75,6 +90,8 @@ def decode_raw(encoding: str, height: int, width: int, step: int, big_endian: bo
     rows = np.frombuffer(data, np.uint8, height * step).reshape(height, step)[:, :row]
     pixels = np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
     pixels = pixels.astype(dtype.newbyteorder("="), copy=False)
+    if order is not None and len(order) == 1:
+        return np.ascontiguousarray(pixels[:, :, order[0]])
     if order is not None:
         return np.ascontiguousarray(pixels[:, :, list(order)])
     if encoding in _BAYER:

@@ -22,8 +22,8 @@ class CameraImage:
         camera: index of the camera in its recording (`recording.info.cameras`).
         name: of that camera.
         time_ns: absolute time [ns], in the clock of the IMU where the recording says how they differ.
-        pixels: intensities (H, W) uint8 or uint16, or colours (H, W, 3) uint8 in the order red, green, blue; depths
-            (H, W) uint16 or float32, along the optical axis, in units of `depth_unit_m`.
+        pixels: intensities (H, W) uint8 or uint16, or colours (H, W, 3) of either in the order red, green, blue;
+            depths (H, W) uint16 or float32, along the optical axis, in units of `depth_unit_m`.
         exposure_s: how long the shutter was open [s], or None where the recording does not say.
         depth_unit_m: metres of one count of a depth image; None: the image holds intensities.
 
@@ -53,13 +53,11 @@ class CameraImage:
             if not 0.0 < self.depth_unit_m < np.inf:
                 raise InputError("depth_unit_m positive and finite [m]", f"{self.depth_unit_m}", "None for intensities")
             fits = pixels.ndim == 2 and kind in (np.uint16, np.float32)
-        elif pixels.ndim == 2:
-            fits = kind in (np.uint8, np.uint16)
         else:
-            fits = pixels.ndim == 3 and pixels.shape[2] == 3 and kind == np.uint8
+            fits = (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)) and kind in (np.uint8, np.uint16)
         if not fits or min(pixels.shape) < 1:
             raise InputError(
-                "intensities (H, W) uint8 or uint16, colours (H, W, 3) uint8, or depths (H, W) uint16 or float32 with their unit",
+                "intensities (H, W) or colours (H, W, 3), uint8 or uint16, or depths (H, W) uint16 or float32 with their unit",
                 f"{kind} of shape {pixels.shape}",
                 "convert the array first",
             )
@@ -84,7 +82,7 @@ class CameraImage:
             raise InputError("an image of intensities", f"depths of {self.name}", "take depth() of it")
         if self.pixels.ndim == 2:
             return self.pixels
-        grey: NDArray[np.uint8] = np.rint(self.pixels.astype(np.float32) @ _LUMA).astype(np.uint8)
+        grey: NDArray[Any] = np.rint(self.pixels.astype(np.float32) @ _LUMA).astype(self.pixels.dtype)
         return grey
 
     def depth(self) -> NDArray[np.float32]:

@@ -40,25 +40,37 @@ def test_raw_colours_come_as_red_green_blue() -> None:
         "bgra8": np.concatenate([COLOUR[:, :, ::-1], alpha], axis=2),
     }
     for encoding, pixels in written.items():
-        data = np.ascontiguousarray(pixels)
-        np.testing.assert_array_equal(decode_raw(encoding, 7, 5, data.shape[1] * data.shape[2], False, data.tobytes()), COLOUR)
+        for kind, factor in (("u1", 1), (">u2", 250)):
+            data = (pixels.astype(np.uint16) * factor).astype(kind)
+            name = encoding if factor == 1 else encoding.replace("8", "16")
+            read = decode_raw(name, 7, 5, data.shape[1] * data.shape[2] * data.itemsize, True, data.tobytes())
+            np.testing.assert_array_equal(read, COLOUR.astype(np.uint16) * factor)
+            assert read.dtype == np.dtype(kind).newbyteorder("=")
+
+
+@pytest.mark.parametrize(("encoding", "at"), [("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)])
+def test_of_luminance_and_chrominance_the_luminance_is_taken(encoding: str, at: int) -> None:
+    both = np.full((7, 5, 2), 128, np.uint8)
+    both[:, :, at] = GREY
+    np.testing.assert_array_equal(decode_raw(encoding, 7, 5, 10, False, both.tobytes()), GREY)
 
 
 @needs_cv2
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_a_mosaic_of_one_colour_is_that_colour(pattern: str) -> None:
-    colour = {"r": 200, "g": 100, "b": 50}
-    mosaic = np.zeros((8, 10), np.uint8)
+@pytest.mark.parametrize(("bits", "factor"), [(8, 1), (16, 300)])
+def test_a_mosaic_of_one_colour_is_that_colour(pattern: str, bits: int, factor: int) -> None:
+    colour = {"r": 200 * factor, "g": 100 * factor, "b": 50 * factor}
+    mosaic = np.zeros((8, 10), f"u{bits // 8}")
     for number, letter in enumerate(pattern):
         mosaic[number // 2 :: 2, number % 2 :: 2] = colour[letter]
-    pixels = decode_raw(f"bayer_{pattern}8", 8, 10, 10, False, mosaic.tobytes())
-    assert pixels.shape == (8, 10, 3)
-    assert (pixels == (200, 100, 50)).all()
+    pixels = decode_raw(f"bayer_{pattern}{bits}", 8, 10, 10 * bits // 8, False, mosaic.tobytes())
+    assert pixels.shape == (8, 10, 3) and pixels.dtype == mosaic.dtype
+    assert (pixels == tuple(colour.values())).all()
 
 
 def test_raw_images_that_do_not_fit_are_refused() -> None:
     for encoding, height, width, step, size, reason in (
-        ("yuv422", 2, 2, 4, 8, "unknown encoding 'yuv422', where mono8, "),
+        ("nv21", 2, 2, 4, 8, "unknown encoding 'nv21', where mono8, "),
         ("mono8", 2, 2, 1, 4, "4 bytes in rows of 1 for 2x2 pixels"),
         ("mono8", 2, 2, 2, 3, "3 bytes in rows of 2"),
         ("rgb8", 0, 2, 6, 12, "a size of 2x0 pixels"),
@@ -71,7 +83,6 @@ def test_raw_images_that_do_not_fit_are_refused() -> None:
 @given(st.integers(1, 9), st.integers(1, 9), st.booleans(), st.booleans(), st.integers(0, 2**32 - 1))
 def test_pgm_and_ppm_round_trip(height: int, width: int, deep: bool, colour: bool, seed: int) -> None:
     shape = (height, width, 3) if colour else (height, width)
-    deep = deep and not colour
     pixels = np.random.default_rng(seed).integers(0, 65536 if deep else 256, shape).astype(np.uint16 if deep else np.uint8)
     np.testing.assert_array_equal(decode_file(pgm(pixels)), pixels)
 
