@@ -141,12 +141,16 @@ def _compared(
     events = takewhile(lambda _: not should_stop(), recording)
     if declared is not None:
         for stretch in _turning_stretches(events, *_CHECK):
+            if should_stop():
+                break
             agreement = compare_sensors(*stretch, config, T_declared=declared)
             return agreement, contradictions(agreement, declared)
         return None
     best: Agreement | None = None
     found: list[Finding] = []
     for stretch in islice(_turning_stretches(events, *_ESTIMATE), _MOST_STRETCHES):
+        if should_stop():
+            break
         whole = compare_sensors(*stretch, config, refine=True)
         if not found and (best is None or np.isfinite(_open_rad(whole))):
             found = contradictions(whole, None)
@@ -156,7 +160,7 @@ def _compared(
             pieces = takewhile(lambda _: not should_stop(), _pieces_of(*stretch))
             agreements = (compare_sensors(*piece, config, refine=True) for piece in pieces)
             best = reduce(_better, filter(_is_no_mirror, agreements), best)
-        if is_vain or _open_rad(best) < np.radians(_WIDE_DEG) or should_stop():
+        if is_vain or _open_rad(best) < np.radians(_WIDE_DEG):
             break
     return None if best is None else (best, found)
 

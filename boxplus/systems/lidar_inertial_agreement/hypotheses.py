@@ -356,7 +356,9 @@ def _of_lengths(agreement: Agreement, translation: TranslationFit, T_declared: N
         return Finding("force_sign", text)
     if translation.explained < _FITS or translation.sigma > MISFIT_M or _lags(agreement):
         return None
-    return None if _leaves_lengths_open(translation) else slope_finding(slope, std)
+    if _leaves_lengths_open(translation):
+        return None
+    return slope_finding(slope, float(np.hypot(translation.slope_std_alone, SLOPE_FLOOR)))
 
 
 def _leaves_lengths_open(translation: TranslationFit) -> bool:

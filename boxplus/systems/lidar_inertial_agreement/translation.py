@@ -54,13 +54,14 @@ class TranslationFit:
     Attributes:
         gravity: (3,) [m/s²]; bias: (3,) of the accelerometer [m/s²]; p_imu_lidar: (3,) [m]; slope: see the module.
         turn: (3,) rotation vector by which the accelerations would turn the mounting, R_imu_lidar ← Exp(turn) R_imu_lidar [rad].
-        covariance: (13, 13) of these, in this order; what it moves by when some poses are left out included, of the slope with
-            what that leaves unsure where the stretch is short.
+        covariance: (13, 13) of these, in this order; what it moves by when some poses are left out included.
         stretches: positions and velocities of the IMU at the beginnings of the stretches.
         sigma: rms of what is left of the positions [m].
         chi2: of it, per degree of freedom, before the covariance was scaled by it.
         explained: share of what the accelerometer could explain of the LiDAR's path that it does explain at this slope, 0 to 1.
         samples: positions compared.
+        slope_reserve: added to the slope's variance where this stretch alone decides, as few groups of poses tell that variance
+            coarsely; several stretches together tell it by what they differ by.
     """
 
     gravity: NDArray[np.float64]
@@ -74,10 +75,16 @@ class TranslationFit:
     chi2: float
     explained: float
     samples: int
+    slope_reserve: float = 0.0
 
     @property
     def slope_std(self) -> float:
         return float(np.sqrt(self.covariance[SLOPE, SLOPE]))
+
+    @property
+    def slope_std_alone(self) -> float:
+        """Where three of it are to hold for this stretch alone."""
+        return float(np.sqrt(self.covariance[SLOPE, SLOPE] + self.slope_reserve))
 
 
 class BodyAttitude:
@@ -150,8 +157,6 @@ def compare_accelerations(
     inflate = max(chi2, 1.0)
     scaled: NDArray[np.float64] = np.linalg.inv(whole.measured / inflate + whole.known).astype(np.float64) + shared
     fitted: NDArray[np.float64] = np.linalg.inv(whole.measured / max(chi2, _LEAST_CHI2) + whole.known).astype(np.float64) + shared
-    # The slope alone is held against a threshold of some standard deviations.
-    fitted[SLOPE, SLOPE] += (few_groups(groups) ** 2 - 1.0) * shared[SLOPE, SLOPE]
     begins = []
     for stretch in stretches:
         part = stretch.reduced()
@@ -176,6 +181,7 @@ def compare_accelerations(
         chi2,
         explained,
         samples,
+        float((few_groups(groups) ** 2 - 1.0) * shared[SLOPE, SLOPE]),
     )
 
 

@@ -362,8 +362,9 @@ class VisualInertialOdometry:
         self._watches.add(pose, state, covariance, self.window.last_step)
         if is_keyframe and not rests:
             self._watches.add_keyframe(tracks, pose, state, self._rate(tracks.time_ns))
-        sigma, told = position_sigma(covariance), (self._watches.among_cameras, self._watches.apart)
-        status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, sigma, *told, limits)
+        among, apart = self._watches.among_cameras, self._watches.apart
+        sigma = position_sigma(covariance)
+        status, reasons = self._health.judge(tracks, fit, rests, self.window.gap_s, sigma, among, apart, limits)
         return VioEstimate(
             time_ns=tracks.time_ns,
             status=status,

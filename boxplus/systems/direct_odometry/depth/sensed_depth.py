@@ -58,8 +58,7 @@ def rgbd_depth(depth: ArrayLike, image: Image, noise: tuple[float, float, float]
         raise InputError("depth not negative [m]", f"{z.min()}", "mark pixels without depth by 0 or NaN")
     known = z[::4, ::4]
     known = known[known > 0.0]
-    typical = float(np.median(known)) if len(known) else _NEAREST
-    if not _NEAREST <= typical <= _FARTHEST:
+    if len(known) and not _NEAREST <= (typical := float(np.median(known))) <= _FARTHEST:
         these = "millimetres" if typical > _FARTHEST else "metres that were divided by 1000"
         raise InputError(
             f"depths [m] with a median of {_NEAREST:g} to {_FARTHEST:g}",

@@ -314,7 +314,7 @@ def _problem(facts: Mapping[str, float], is_mono: bool, config: VioConfig) -> st
         (
             "accelerometer bias [m/s²]",
             _BIAS_SIGMAS * config.accel_bias_sigma,
-            "the accelerometer's bias would be {:.2f} m/s² (at most {:g}), as where its scale is wrong",
+            "the accelerometer's bias would be {:.2f} m/s² (at most {:g}): its scale or the mounting may be wrong",
         ),
         (
             "gravity, deviation beside the bias [deg]",
