@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import islice, takewhile
@@ -33,6 +33,7 @@ _MOST_STRETCHES = 5  # that are looked at in vain
 # A narrow view that loses hold once leaves nothing of a stretch: pieces of it, as begin and end in shares of its length.
 _PIECES = (0.0, 0.5), (0.25, 0.75), (0.5, 1.0)
 _FEWEST_SCANS = 15  # of a piece
+_PARTLY = 0.4  # of the turns, that a mounting explains where it is tried again
 _FAR_LESS = 0.3  # of what a mirror leaves unexplained, a mounting may leave
 _NO_MOUNTING: frozenset[Cause] = frozenset({"gyro_unit", "gyro_sign", "not_together"})  # then none explains any stretch
 _WIDE_DEG, _WIDE_M = 10.0, 0.3
@@ -105,7 +106,7 @@ def choose_extrinsic(recording: Recording, config: LioConfig, *, should_stop: Ca
     Args:
         recording: opened.
         config: of the odometry.
-        should_stop: asked between events, comparisons, and in that first run; True ends them, and what is known by then stands.
+        should_stop: asked between comparisons and in that first run; True ends them, and what is known by then stands.
 
     Raises:
         RecordingError: nothing at all could be read.
@@ -138,19 +139,14 @@ def _compared(
     Where none does it is the one that shows most of it, or the first one. With it come what whole stretches contradict. None
     without scans and samples.
     """
-    events = takewhile(lambda _: not should_stop(), recording)
     if declared is not None:
-        for stretch in _turning_stretches(events, *_CHECK):
-            if should_stop():
-                break
+        for stretch in _turning_stretches(recording, *_CHECK):
             agreement = compare_sensors(*stretch, config, T_declared=declared)
             return agreement, contradictions(agreement, declared)
         return None
     best: Agreement | None = None
     found: list[Finding] = []
-    for stretch in islice(_turning_stretches(events, *_ESTIMATE), _MOST_STRETCHES):
-        if should_stop():
-            break
+    for stretch in islice(_turning_stretches(recording, *_ESTIMATE), _MOST_STRETCHES):
         whole = compare_sensors(*stretch, config, refine=True)
         if not found and (best is None or np.isfinite(_open_rad(whole))):
             found = contradictions(whole, None)
@@ -158,9 +154,12 @@ def _compared(
         is_vain = any(finding.cause in _NO_MOUNTING for finding in found)
         if not is_vain and not np.isfinite(_open_rad(whole)):
             pieces = takewhile(lambda _: not should_stop(), _pieces_of(*stretch))
-            agreements = (compare_sensors(*piece, config, refine=True) for piece in pieces)
-            best = reduce(_better, filter(_is_no_mirror, agreements), best)
-        if is_vain or _open_rad(best) < np.radians(_WIDE_DEG):
+            parts = [compare_sensors(*piece, config, refine=True) for piece in pieces]
+            begun = _partly_right([whole, *parts])
+            if begun is not None and not should_stop():
+                parts.append(compare_sensors(*stretch, config, T_expected=begun, refine=True))
+            best = reduce(_better, filter(_is_no_mirror, parts), best)
+        if is_vain or _open_rad(best) < np.radians(_WIDE_DEG) or should_stop():
             break
     return None if best is None else (best, found)
 
@@ -179,6 +178,23 @@ def _is_no_mirror(agreement: Agreement) -> bool:
     """Whether a mounting explains the turns far better than a mirror: few seconds, about two axes, show no flipped sign."""
     rotation = agreement.rotation
     return rotation is not None and 1.0 - rotation.explained < _FAR_LESS * (1.0 - rotation.mirrored)
+
+
+def _partly_right(agreements: Sequence[Agreement]) -> NDArray[np.float64] | None:
+    """(4, 4) T_imu_lidar of the one that explains most of the turns where none explains enough; None where a mirror does as well.
+
+    Turns of 200 deg/s throw a registration off that nobody helps, and what is left of the path still shows the mounting coarsely:
+    with it the gyroscope may help.
+    """
+    fits = [agreement.rotation for agreement in agreements if agreement.rotation is not None]
+    best = max(fits, key=lambda fit: fit.explained, default=None)
+    if best is None or any(np.isfinite(_open_rad(agreement)) and _is_no_mirror(agreement) for agreement in agreements):
+        return None
+    if best.explained < _PARTLY or best.mirrored > best.explained:
+        return None
+    T = np.eye(4)
+    T[:3, :3] = best.R_imu_lidar
+    return T
 
 
 def _pieces_of(scans: list[Scan], imu: ImuSamples) -> Iterator[tuple[list[Scan], ImuSamples]]:

@@ -176,7 +176,8 @@ def test_the_same_view_again_tells_nothing_new_of_focal_lengths() -> None:
     resting, _ = run(Flight(3, 1.2), rig(), CONFIG)
     moving, _ = run(Flight(3, 3.0), rig(), CONFIG)
     assert resting.start is not None and resting.start.kind == "at rest"
-    assert np.isinf(resting._focal_watch.sigma).all() and np.isfinite(moving._focal_watch.sigma).all()
+    at_rest, on_the_way = resting._watches._focal.sigma, moving._watches._focal.sigma
+    assert np.isinf(at_rest).all() and np.isfinite(on_the_way).all()
 
 
 @pytest.mark.parametrize("limit", [0.55, 0.7, np.inf])
