@@ -2,9 +2,9 @@
 
 A second camera whose image is taken later by τ has moved on by then. By its angular velocity ω and velocity v, in its own axes,
 a point Y = R m + ρ t of it, m the ray of the first camera and ρ its inverse depth, is Y − τ (ω × Y + ρ v). Across the epipolar
-line with normal n = t × R m its ray y lies off by
+line with normal n its ray y lies off by (`epipolar_offsets.py`)
 
-    e = n · y / |n_xy| ≈ −τ n · (ω × Y + ρ v) / (Y_z |n_xy|)
+    e ≈ −τ n · (ω × Y + ρ v) / (Y_z |n_xy|)
 
 A mounting that is turned and another focal length, which `focal_watch.py` asks for, put rays off by the same whatever the motion,
 and are asked for beside τ: it is told from them by motions that change, and by nothing else. Another distortion is not asked for:
@@ -20,6 +20,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.systems.visual_inertial_odometry.corners.epipolar_offsets import TURN_SIGMA, offset_sigmas, offsets, pairs_of_rays
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.corners.triangulation import inverse_depths
 from boxplus.systems.visual_inertial_odometry.rig import Rig
@@ -27,7 +28,6 @@ from boxplus.systems.visual_inertial_odometry.rig import Rig
 _MEMORY = 0.95  # of the sums, per keyframe
 _FEWEST = 100  # pairs of corners, as the sums remember them
 _LEAST_S, _SIGMAS = 0.0015, 10.0  # of τ: stamps up to 1 ms apart are one instant, and corners without texture err together
-_TURN_SIGMA = 0.05  # rad, of a mounting beforehand
 _LATE_SIGMA = 0.1  # s, of τ beforehand
 
 Floats = NDArray[np.float64]
@@ -47,8 +47,8 @@ class InstantWatch:
 
     def __init__(self, rig: Rig, pixel_sigma: float) -> None:
         self._T_imu_camera = [camera.T_imu_camera for camera in rig.cameras]
-        others = len(rig.cameras) - 1
-        self._sigmas = [pixel_sigma * math.hypot(1.0 / rig.cameras[0].model.fx, 1.0 / c.model.fx) for c in rig.cameras[1:]]
+        self._sigmas = offset_sigmas(rig, pixel_sigma)
+        others = len(self._sigmas)
         self._H = np.zeros((others, 5, 5))  # of τ, the focal length and the mounting
         self._b = np.zeros((others, 5))
         self._squares, self._count = np.zeros(others), np.zeros(others)
@@ -61,13 +61,16 @@ class InstantWatch:
             rate, velocity: (3,) of the IMU at its time, in the axes of the IMU [rad/s, m/s].
         """
         for k, (T, sigma) in enumerate(zip(self._T_imu_camera[1:], self._sigmas, strict=True)):
-            both = np.isfinite(tracks.rays[:, k + 1, 0])
             T_other_first = np.linalg.inv(T) @ self._T_imu_camera[0]
-            turned, t = tracks.rays[both, 0] @ T_other_first[:3, :3].T, np.ascontiguousarray(T_other_first[:3, 3])
+            turned, rays, normals, _ = pairs_of_rays(tracks, k + 1, T_other_first)
             R_other_imu = T[:3, :3].T
             w, v = R_other_imu @ rate, R_other_imu @ (velocity + np.cross(rate, T[:3, 3]))
-            a, e = _equations(turned, t, tracks.rays[both, k + 1], w, v)
-            a, e = a / sigma, e / sigma
+            still, e = offsets(rays, normals)
+            t = np.ascontiguousarray(T_other_first[:3, 3])
+            rho, _ = inverse_depths(turned, t, rays)
+            Y = turned + rho[:, None] * t
+            late = -(normals * (np.cross(w, Y) + rho[:, None] * v)).sum(axis=1) / Y[:, 2]
+            a, e = np.column_stack([late, still]) / sigma, e / sigma
             self._H[k] = _MEMORY * self._H[k] + a.T @ a
             self._b[k] = _MEMORY * self._b[k] + a.T @ e
             self._squares[k] = _MEMORY * self._squares[k] + e @ e
@@ -78,7 +81,7 @@ class InstantWatch:
         """τ of a camera and its standard deviation, by what is left of the corners where that is more than their noise."""
         if self._count[k] < _FEWEST:
             return 0.0, math.inf
-        P = np.linalg.inv(self._H[k] + np.diag([_LATE_SIGMA**-2, 1.0, *[_TURN_SIGMA**-2] * 3]))
+        P = np.linalg.inv(self._H[k] + np.diag([_LATE_SIGMA**-2, 1.0, *[TURN_SIGMA**-2] * 3]))
         x = P @ self._b[k]
         left = (self._squares[k] - self._b[k] @ x) / self._count[k]
         return float(x[0]), math.sqrt(max(left, 1.0) * P[0, 0])
@@ -95,18 +98,3 @@ class InstantWatch:
                     "a lens that is distorted otherwise than it was calibrated looks the same"
                 )
         return None
-
-
-def _equations(turned: Floats, t: Floats, rays: Floats, w: Floats, v: Floats) -> tuple[Floats, Floats]:
-    """Slopes (n, 5) of e (n,) by τ, ε and θ, see the head and that of `focal_watch.py`; rays along the baseline tell nothing."""
-    n = np.cross(t, turned)
-    length = np.linalg.norm(n[:, :2], axis=1)
-    seen = length > 0.0
-    turned, rays, n, length = turned[seen], rays[seen], n[seen], length[seen, None]
-    rho, _ = inverse_depths(turned, t, rays)
-    Y = turned + rho[:, None] * t
-    moved = np.cross(w, Y) + rho[:, None] * v
-    n = n / length
-    late = -(n * moved).sum(axis=1) / Y[:, 2]
-    longer = (n[:, :2] * rays[:, :2]).sum(axis=1)
-    return np.column_stack([late, longer, np.cross(rays, n)]), np.asarray((n * rays).sum(axis=1))
