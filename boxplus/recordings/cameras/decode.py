@@ -26,12 +26,18 @@ _NETPBM_HEADER = re.compile(
 )
 _LARGEST_SIDE = 1 << 15
 
-_RAW: dict[str, tuple[str, int, tuple[int, ...] | None]] = {
-    "mono8": ("u1", 1, None),
-    "8UC1": ("u1", 1, None),
-    "mono16": ("u2", 1, None),
-    "16UC1": ("u2", 1, None),
-    "32FC1": ("f4", 1, None),
+# OpenCV names a mosaic by the second row's second and third pixel, ROS by the first row's first two and the one below.
+_BAYER = {
+    f"bayer_{pattern}{bits}": code
+    for pattern, code in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB"))
+    for bits in (8, 16)
+}
+_RAW: dict[str, tuple[str, int, tuple[int, ...]]] = {
+    "mono8": ("u1", 1, (0,)),
+    "8UC1": ("u1", 1, (0,)),
+    "mono16": ("u2", 1, (0,)),
+    "16UC1": ("u2", 1, (0,)),
+    "32FC1": ("f4", 1, (0,)),
     "rgb8": ("u1", 3, (0, 1, 2)),
     "bgr8": ("u1", 3, (2, 1, 0)),
     "rgba8": ("u1", 4, (0, 1, 2)),
@@ -44,18 +50,12 @@ _RAW: dict[str, tuple[str, int, tuple[int, ...] | None]] = {
     "uyvy": ("u1", 2, (1,)),
     "yuv422_yuy2": ("u1", 2, (0,)),
     "yuyv": ("u1", 2, (0,)),
+    **{name: ("u2" if name.endswith("16") else "u1", 1, (0,)) for name in _BAYER},
 }
-"""Type, channels, and which of them are red, green, blue, or the luminance alone, by the encodings of
+"""Type, channels, and which of them are red, green, blue, or all there is of light, by the encodings of
 sensor_msgs/image_encodings.h."""
 
-# OpenCV names a mosaic by the second row's second and third pixel, ROS by the first row's first two and the one below.
-_BAYER = {
-    f"bayer_{pattern}{bits}": code
-    for pattern, code in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB"))
-    for bits in (8, 16)
-}
-
-ENCODINGS = (*_RAW, *_BAYER)
+ENCODINGS = tuple(_RAW)
 DEPTH_ENCODINGS = {"16UC1": 1e-3, "32FC1": 1.0}
 """Encodings of depth images and metres of one count (REP 118)."""
 
@@ -80,7 +80,7 @@ def decode_raw(encoding: str, height: int, width: int, step: int, big_endian: bo
     """
     if encoding not in ENCODINGS:
         raise MalformedImageError(f"unknown encoding {encoding!r}, where {', '.join(ENCODINGS)} are read")
-    kind, channels, order = _RAW.get(encoding, ("u2" if encoding.endswith("16") else "u1", 1, None))
+    kind, channels, order = _RAW[encoding]
     dtype = np.dtype(kind).newbyteorder(">" if big_endian else "<")
     row = width * channels * dtype.itemsize
     if not (0 < height <= _LARGEST_SIDE and 0 < width <= _LARGEST_SIDE):
@@ -90,14 +90,10 @@ def decode_raw(encoding: str, height: int, width: int, step: int, big_endian: bo
     rows = np.frombuffer(data, np.uint8, height * step).reshape(height, step)[:, :row]
     pixels = np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
     pixels = pixels.astype(dtype.newbyteorder("="), copy=False)
-    if order is not None and len(order) == 1:
-        return np.ascontiguousarray(pixels[:, :, order[0]])
-    if order is not None:
-        return np.ascontiguousarray(pixels[:, :, list(order)])
     if encoding in _BAYER:
         cv2 = require("cv2", "to decode Bayer mosaics", RecordingError)
         return np.asarray(cv2.cvtColor(pixels[:, :, 0], getattr(cv2, f"COLOR_Bayer{_BAYER[encoding]}2RGB")))
-    return pixels[:, :, 0]
+    return np.ascontiguousarray(pixels[:, :, list(order)] if len(order) > 1 else pixels[:, :, order[0]])
 
 
 def decode_file(data: bytes) -> Pixels:

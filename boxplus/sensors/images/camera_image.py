@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from boxplus._arguments import require
 from boxplus.errors import InputError
 
-_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # red, green, blue (ITU-R BT.601)
+LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # red, green, blue (ITU-R BT.601)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +82,7 @@ class CameraImage:
             raise InputError("an image of intensities", f"depths of {self.name}", "take depth() of it")
         if self.pixels.ndim == 2:
             return self.pixels
-        grey: NDArray[Any] = np.rint(self.pixels.astype(np.float32) @ _LUMA).astype(self.pixels.dtype)
+        grey: NDArray[Any] = np.rint(self.pixels.astype(np.float32) @ LUMA).astype(self.pixels.dtype)
         return grey
 
     def depth(self) -> NDArray[np.float32]:

@@ -13,8 +13,7 @@ from boxplus._numbers import as_array, is_array
 from boxplus.cameras.pinhole import Pinhole
 from boxplus.errors import InputError
 from boxplus.residuals.camera.photometric_sampling import checked_image
-
-_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # red, green, blue (ITU-R BT.601)
+from boxplus.sensors.images.camera_image import LUMA
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +50,7 @@ class Image:
         """
         array = as_array(values, "image")
         if array.ndim == 3 and array.shape[2] in (3, 4):
-            array = array[..., :3].astype(np.float32) @ _LUMA
+            array = array[..., :3].astype(np.float32) @ LUMA
         return cls(checked_image("image", array))
 
     @property
