@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.maps.ikd_tree.inner import boxes_sq
 from boxplus.maps.ikd_tree.leaf import BUCKET, count_bits, lanes_within, trailing_zeros
+from boxplus.maps.ikd_tree.nearest_list import LANES, entry, list_of, take_in, ties
 from boxplus.maps.ikd_tree.pool import (
     INDEX_MASK,
     LABEL_DEAD,
@@ -152,6 +153,64 @@ def next_leaf(
         ref, live = np.uint32(stack[top]["ref"]), np.uint32(stack[top]["live"])
 
 
+@kernel(inline=True, borrow=True)
+def pack(sq: np.float32, point: np.uint32) -> np.uint64:
+    """A squared distance and a point as one number, which is ordered like them."""
+    return np.uint64(np.uint64(np.float32(sq).view(np.uint32)) << _POINT_BITS | np.uint64(point))
+
+
+@kernel(inline=True, borrow=True)
+def packed_sq(packed: np.uint64) -> np.float32:
+    """The squared distance of a packed point."""
+    return np.float32(np.uint32(packed >> _POINT_BITS).view(np.float32))
+
+
+@kernel(inline=True, borrow=True)
+def tied(a: np.uint64, b: np.uint64) -> bool:
+    """Whether two packed points, the first not after the second, are equally far."""
+    return bool((a >> _POINT_BITS == b >> _POINT_BITS) & (np.uint32(b) != NIL))
+
+
+@kernel(inline=True, borrow=True)
+def few_nearest(
+    view: IkdView,
+    qx: np.float32,
+    qy: np.float32,
+    qz: np.float32,
+    max_sq: np.float32,
+    out_sq: NDArray[np.float32],
+    stack: NDArray[np.void],
+) -> np.int64:
+    """`knn` for fewer than LANES neighbours, without branches; -1 where some are equally far, which this does not settle."""
+    inner, leaf = view
+    k, width = len(out_sq), np.uint32(BUCKET)
+    worst, nearest = max_sq, list_of(pack(max_sq, NIL))
+    ref, live = enter(inner, qx, qy, qz, max_sq)
+    top = ZERO
+    while True:
+        ref, live, top = next_leaf(inner, ref, live, top, worst, qx, qy, qz, stack)
+        if ref == NIL:
+            break
+        index = ref & INDEX_MASK
+        bits = leaf_within(leaf, index, qx, qy, qz, worst, live)
+        while bits != ZERO:
+            i = trailing_zeros(bits)
+            bits &= bits - ONE
+            take_in(nearest, pack(point_sq(leaf, index, i, qx, qy, qz), np.uint32(index * width + i)))
+        worst = packed_sq(entry(nearest, np.uint32(k - 1)))
+        ref = NIL
+    if ties(nearest) & all_bits(np.uint32(k)):
+        return np.int64(-1)
+    first = np.uint32(len(stack) - k)
+    found = np.int64(0)
+    for place in range(k):
+        packed = entry(nearest, np.uint32(place))
+        out_sq[place] = packed_sq(packed)
+        stack[first + np.uint32(place)]["ref"] = np.uint32(packed)
+        found += np.int64(np.uint32(packed) != NIL)
+    return found
+
+
 @kernel(borrow=True)
 def knn(
     view: IkdView,
@@ -174,6 +233,10 @@ def knn(
     """
     inner, leaf = view
     k = len(out_sq)
+    if k < LANES:
+        few = few_nearest(view, qx, qy, qz, max_sq, out_sq, stack)
+        if few >= 0:
+            return np.int64(few)
     last = np.uint32(k - 1)
     first = np.uint32(len(stack) - k)
     worst = max_sq
@@ -247,24 +310,6 @@ def copy_found(view: IkdView, stack: NDArray[np.void], k: int, found: int, out_x
         out_xyz[i, 0] = record["x"][j]
         out_xyz[i, 1] = record["y"][j]
         out_xyz[i, 2] = record["z"][j]
-
-
-@kernel(inline=True, borrow=True)
-def pack(sq: np.float32, point: np.uint32) -> np.uint64:
-    """A squared distance and a point as one number, which is ordered like them."""
-    return np.uint64(np.uint64(np.float32(sq).view(np.uint32)) << _POINT_BITS | np.uint64(point))
-
-
-@kernel(inline=True, borrow=True)
-def packed_sq(packed: np.uint64) -> np.float32:
-    """The squared distance of a packed point."""
-    return np.float32(np.uint32(packed >> _POINT_BITS).view(np.float32))
-
-
-@kernel(inline=True, borrow=True)
-def tied(a: np.uint64, b: np.uint64) -> bool:
-    """Whether two packed points, the first not after the second, are equally far."""
-    return bool((a >> _POINT_BITS == b >> _POINT_BITS) & (np.uint32(b) != NIL))
 
 
 @kernel(borrow=True)

@@ -94,7 +94,7 @@ class TreesAgainstBruteForce(RuleBasedStateMachine):
         hi = np.add(lo, side)
         assert set(self.each("reinsert_box", lo, hi)) == {self.truth.reinsert_box(lo, hi)}
 
-    @rule(seed=st.integers(0, 1000), k=st.sampled_from((1, 2, 5, 9)), limit=st.sampled_from((0.0, 0.4, 1.0, np.inf)))
+    @rule(seed=st.integers(0, 1000), k=st.sampled_from((1, 2, 5, 9, 15, 16, 20)), limit=st.sampled_from((0.0, 0.4, 1.0, np.inf)))
     def nearest(self, seed: int, k: int, limit: float) -> None:
         rng = np.random.default_rng(seed)
         queries = np.concatenate([rng.uniform(-4, 4, (8, 3)), np.round(rng.uniform(-3, 3, (4, 3)))])
