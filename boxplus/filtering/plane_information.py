@@ -101,7 +101,6 @@ def accumulate_planes(
     A: NDArray[np.float64],
     b: NDArray[np.float64],
     pull: NDArray[np.float64],
-    signal: NDArray[np.float64],
     noise: NDArray[np.float64],
     sums: NDArray[np.float64],
 ) -> None:
@@ -118,9 +117,8 @@ def accumulate_planes(
         with_extrinsic: whether the six columns of the extrinsic are measured.
         A, b: (12, 12), (12,), added to.
         pull: (12,), added to: what noise of the normals is expected to make of b.
-        with_criterion: whether `pull`, `signal` and `noise` are wanted.
-        signal, noise: (6, 6), added to: the information about the pose of planes that are sure, and what Cov(u) of these planes
-            alone would give.
+        with_criterion: whether `pull` and `noise` are wanted.
+        noise: (6, 6), added to: what Cov(u) of these planes alone would give of A about the pose.
         sums: (2,) += [used points, Σ z²].
     """
     h = np.empty(MEASURED_DOF)
@@ -161,15 +159,10 @@ def accumulate_planes(
                 A[i, j] += wh * h[j]
         if with_criterion:
             _add_noise(x, (lx, ly, lz), (sx, sy, sz), plane, (t0, t1), weight, with_extrinsic, row, pull, noise)
-            for i in range(6):
-                wh = weight * h[i]
-                for j in range(i, 6):
-                    signal[i, j] += wh * h[j]
         sums[0] += 1.0
         sums[1] += z * z
     _mirror(A)
     if with_criterion:
-        _mirror(signal)
         _mirror(noise)
 
 
@@ -187,7 +180,6 @@ def accumulate_parts(
     A: NDArray[np.float64],
     b: NDArray[np.float64],
     pull: NDArray[np.float64],
-    signal: NDArray[np.float64],
     noise: NDArray[np.float64],
     sums: NDArray[np.float64],
 ) -> None:
@@ -200,7 +192,7 @@ def accumulate_parts(
         begin, end = bounds[part], bounds[part + 1]
         accumulate_planes(
             x, p_lidar[begin:end], planes[begin:end], fate[begin:end], range_variance, map_variance, with_extrinsic,
-            with_criterion, A[part], b[part], pull, signal, noise, sums,
+            with_criterion, A[part], b[part], pull, noise, sums,
         )  # fmt: skip
 
 

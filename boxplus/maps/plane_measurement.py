@@ -106,13 +106,13 @@ class PlaneMeasurement:
         if matches:
             self._match(x)
         total = self._sums(x, edges, criterion=matches)
-        if matches and self._confirm and self._look_closer(x, total[0].sum(axis=0), int(total[5][0])):
+        if matches and self._confirm and self._look_closer(x, total[0].sum(axis=0), int(total[4][0])):
             total = self._sums(x, edges, criterion=True)
-        A, b, pull, signal, noise, sums = total
+        A, b, pull, noise, sums = total
         if matches:  # in between the planes stay, and what they can tell
             self._pull = pull
             threshold = threshold_for(self._config.weak_threshold, int(sums[0]))
-            self._directions = pose_directions(signal, noise, self.lever_arm, threshold)
+            self._directions = pose_directions(A.sum(axis=0)[:6, :6], noise, self.lever_arm, threshold)
         used = int(sums[0])
         rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
         A, b = A * self._weight, b * self._weight
@@ -148,16 +148,16 @@ class PlaneMeasurement:
         return {reason: int(counts[fate]) for fate, reason in REASONS.items() if counts[fate]}
 
     def _sums(self, x: NDArray[np.float64], bounds: NDArray[np.int64], *, criterion: bool) -> tuple[NDArray[np.float64], ...]:
-        """What `accumulate_parts` adds up over planes: A, b, pull, signal, noise and sums."""
+        """What `accumulate_parts` adds up over planes: A, b, pull, noise and sums."""
         parts = len(bounds) - 1
         A, b, pull = np.zeros((parts, MEASURED_DOF, MEASURED_DOF)), np.zeros((parts, MEASURED_DOF)), np.zeros(MEASURED_DOF)
-        signal, noise, sums = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(2)
+        noise, sums = np.zeros((6, 6)), np.zeros(2)
         point, stored = self._config.range_sigma**2, self._config.map_sigma**2
         accumulate_parts(
             x, self._p_lidar, self._planes, self._fate, bounds, point, stored, self._with_extrinsic, criterion,
-            A, b, pull, signal, noise, sums,
+            A, b, pull, noise, sums,
         )  # fmt: skip
-        return A, b, pull, signal, noise, sums
+        return A, b, pull, noise, sums
 
     def _look_closer(self, x: NDArray[np.float64], information: NDArray[np.float64], used: int) -> bool:
         """Refuse planes on which too much hangs (`plane_confirmation`), bend those that are none (`curved_patches`).
