@@ -17,6 +17,7 @@ import pytest
 
 from boxplus.errors import InputError
 from boxplus.formats.trajectory import read_trajectory
+from boxplus.maps.ikd_tree.answers import Neighbors
 from boxplus.recordings import open_recording
 from boxplus.recordings.recording import Recording
 from boxplus.runs import checkpoint
@@ -236,6 +237,8 @@ def test_a_checkpoint_makes_nothing_but_objects_of_boxplus(tmp_path: Path, name:
         read_state(tmp_path / "state.npz")
     with pytest.raises(TypeError, match=r"holds no pathlib"):
         write_state(tmp_path / "other.npz", {"x": tmp_path})
+    with pytest.raises(TypeError, match=r"holds no boxplus.maps.ikd_tree.answers.Neighbors"):
+        write_state(tmp_path / "other.npz", {"x": Neighbors(np.zeros((0, 1)), np.zeros((0, 1, 3)), np.zeros(0, np.int64))})
 
 
 def test_the_recording_is_known_wherever_it_lies(tmp_path: Path) -> None:

@@ -33,7 +33,8 @@ _WITHOUT_STATES = ("cli", "report", "simulation")  # nothing that estimates impo
 def write_state(path: Path, state: dict[str, Any]) -> None:
     """Write `state` in one step: numbers, text, containers, arrays, and objects of boxplus made of these.
 
-    What runs on another thread becomes None: whoever began it has to begin it again. A lock is read as a new one that is open.
+    What runs on another thread becomes None: whoever began it has to begin it again. So does what an object makes anew from the
+    rest of itself, the attributes that its class names in `MADE_ANEW`. A lock is read as a new one that is open.
 
     Raises:
         OutputError: the disk is full; the file before stays.
@@ -122,7 +123,7 @@ class _Encoder:
             return {"array": len(self.arrays) - 1}
         if isinstance(value, list):
             return [self.encode(entry) for entry in value]
-        if isinstance(value, tuple | set):
+        if type(value) in (tuple, set):  # one with names of its own would come back without them
             return {type(value).__name__: [self.encode(entry) for entry in value]}
         if isinstance(value, deque):
             return {"deque": [self.encode(entry) for entry in value], "maxlen": value.maxlen}
@@ -139,7 +140,7 @@ class _Encoder:
 
     def _encode_object(self, value: Any) -> Any:
         kind = type(value)
-        if not kind.__module__.startswith("boxplus."):
+        if not kind.__module__.startswith("boxplus.") or isinstance(value, tuple):
             raise TypeError(f"a checkpoint holds no {kind.__module__}.{kind.__qualname__}")
         if id(value) in self._known:
             return {"same": self._known[id(value)]}
@@ -150,7 +151,9 @@ class _Encoder:
             return {"model": name, "json": value.model_dump_json()}
         slots = [slot for base in kind.__mro__ for slot in getattr(base, "__slots__", ()) if hasattr(value, slot)]
         names = [*getattr(value, "__dict__", {}), *slots]
-        return {"object": name, "attributes": {attribute: self.encode(getattr(value, attribute)) for attribute in names}}
+        anew = getattr(kind, "MADE_ANEW", ())
+        kept = {attribute: None if attribute in anew else self.encode(getattr(value, attribute)) for attribute in names}
+        return {"object": name, "attributes": kept}
 
 
 class _Decoder:

@@ -24,8 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.filtering.map_datum import MapDatum, positive_part
+from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.registration_config import RegistrationConfig
-from boxplus.systems.lidar_inertial_agreement.lidar_path.older_scans import deviations_of, map_of, register_to
+from boxplus.systems.lidar_inertial_agreement.lidar_path.older_scans import deviations_of, register_to
 from boxplus.systems.lidar_inertial_odometry.mounting.mounting_drift import MountingDrift
 
 _BASELINE_NS = 1_250_000_000
@@ -56,11 +57,15 @@ class LongBaseline:
         with_imu: whether a mounting may be at fault.
     """
 
+    MADE_ANEW = ("_map",)  # where a run goes on
+
     def __init__(self, config: RegistrationConfig, *, with_imu: bool = True) -> None:
         self._config = config.model_copy(update={"threads": 1})
         self._causes = "few rings, a repeating pattern, foliage" + (", or T_imu_lidar" if with_imu else "")
         self._recent: deque[NDArray[np.float64]] = deque(maxlen=_MAP_SCANS)
         self._old: list[NDArray[np.float64]] = []
+        self._laid = 0  # of the old scans, that are in the map of them
+        self._map: IkdTree | None = None
         self._old_ns = 0
 
     def follow(
@@ -84,6 +89,7 @@ class LongBaseline:
         """
         self._recent.append(p_world)
         if time_ns - self._old_ns < _BASELINE_NS and self._old:
+            self._lay_down(1)  # one with each scan: no scan waits for all of them
             return None
         if len(self._recent) < _MAP_SCANS:
             return None
@@ -95,14 +101,24 @@ class LongBaseline:
         drift = self._compare(x, between, p_lidar, seconds) if self._old else None
         if drift is not None:
             datum.widen(drift.excess, x)
-        self._old, self._old_ns = list(self._recent), time_ns
+        self._old, self._laid, self._map, self._old_ns = list(self._recent), 0, None, time_ns
         datum.mark()
         return drift
+
+    def _lay_down(self, scans: int) -> IkdTree:
+        """The map of the old scans, with so many more of them."""
+        laid = min(self._laid + scans, len(self._old))
+        if self._map is None:  # new, or of a run that is gone on with
+            self._map, self._laid = IkdTree(cell_size=self._config.map_cell, rebuild="inplace"), 0
+        for p_world in self._old[self._laid : laid]:
+            self._map.insert(p_world, downsample=True)
+        self._laid = laid
+        return self._map
 
     def _compare(
         self, x: NDArray[np.float64], between: NDArray[np.float64], p_lidar: NDArray[np.float32], seconds: float
     ) -> Drift | None:
-        found = register_to(map_of(self._old, self._config), x, p_lidar, self._config)
+        found = register_to(self._lay_down(len(self._old)), x, p_lidar, self._config)
         if found is None:
             return None
         delta, registration = found
