@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.filtering.small_linalg import symmetric_eigen_into
 
 COINCIDENT_M = 1e-6
 COLLINEAR_RATIO = 0.05
@@ -77,3 +79,56 @@ def fit_plane_into(points: NDArray[np.float32], count: int, max_distance: float,
     plane[7] = max(smallest, 0.0) / max(count - 3, 1)
     plane[8] = middle
     return True
+
+
+class Planes(NamedTuple):
+    """Planes through N handfuls of points, in the points' frame."""
+
+    middles: NDArray[np.float64]  #: (N, 3) mean of the points [m]
+    normals: NDArray[np.float64]  #: (N, 3) unit
+    thickness_sq: NDArray[np.float64]  #: (N,) variance of the points along the normal [m²]
+    width_sq: NDArray[np.float64]  #: (N,) variance across their longest extent within the plane [m²]
+
+
+def planes_through(points: NDArray[np.float64], counts: NDArray[np.int64] | None = None) -> Planes:
+    """The planes through handfuls of points (N, k, 3), of each the first `counts` (N,), one at least; all when not given.
+
+    Where the points lie on a line or in one place, the normal is any across them.
+    """
+    n, k = points.shape[:2]
+    found = Planes(np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n))
+    _planes_into(np.ascontiguousarray(points), np.full(n, k) if counts is None else counts, *found)
+    return found
+
+
+@kernel
+def _planes_into(
+    points: NDArray[np.float64],
+    counts: NDArray[np.int64],
+    middles: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    thickness_sq: NDArray[np.float64],
+    width_sq: NDArray[np.float64],
+) -> None:
+    scatter, axes, values = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    for n in range(len(points)):
+        middle = middles[n]
+        middle[:] = 0.0
+        for j in range(counts[n]):
+            for i in range(3):
+                middle[i] += points[n, j, i]
+        for i in range(3):
+            middle[i] /= counts[n]
+        scatter[:] = 0.0
+        for j in range(counts[n]):
+            for i in range(3):
+                for m in range(i + 1):
+                    scatter[i, m] += (points[n, j, i] - middle[i]) * (points[n, j, m] - middle[m])
+        for i in range(3):
+            for m in range(i + 1):
+                scatter[i, m] /= counts[n]
+                scatter[m, i] = scatter[i, m]
+        symmetric_eigen_into(scatter, values, axes)
+        thickness_sq[n], width_sq[n] = max(values[0], 0.0), max(values[1], 0.0)
+        for i in range(3):
+            normals[n, i] = axes[i, 0]

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba.core import config as numba_config
 
-from boxplus.maps.plane_fit import COLLINEAR_RATIO, fit_plane_into
+from boxplus.maps.plane_fit import COLLINEAR_RATIO, fit_plane_into, planes_through
 
 LIMIT = 0.1
 # The compiled kernel computes in float64; as plain Python, NumPy would compute in the points' own precision.
@@ -113,3 +113,25 @@ def test_only_the_points_counted_are_used() -> None:
     plane = np.zeros(9)
     assert fit_plane_into(points, 3, LIMIT, plane)
     assert np.allclose(np.abs(plane[:3]), [0.0, 0.0, 1.0])
+
+
+@given(seeds, st.sampled_from([0.0, 0.02, 0.3]), st.sampled_from([3, 5, 15, 40]))
+def test_planes_through_handfuls_against_eigenvalues(seed: int, noise: float, count: int) -> None:
+    random = np.random.default_rng(seed)
+    counts = random.integers(1, count + 1, 6)
+    points = np.stack([_patch(seed + k, noise, count) + 100.0 * random.normal(size=3) for k in range(6)])
+    for k, held in enumerate(counts):
+        points[k, held:] = np.nan  # as a search leaves them that finds fewer
+    found = planes_through(points, counts)
+    for k, held in enumerate(counts):
+        few = points[k, :held]
+        values, axes = np.linalg.eigh(np.cov(few.T, bias=True) if held > 1 else np.zeros((3, 3)))
+        assert found.middles[k] == pytest.approx(few.mean(axis=0), abs=1e-9)
+        assert found.thickness_sq[k] == pytest.approx(max(values[0], 0.0), abs=1e-9)
+        assert found.width_sq[k] == pytest.approx(max(values[1], 0.0), abs=1e-9)
+        assert np.linalg.norm(found.normals[k]) == pytest.approx(1.0)
+        if values[1] > 1e-4 and values[0] < 0.5 * values[1]:
+            assert abs(found.normals[k] @ axes[:, 0]) == pytest.approx(1.0, abs=1e-6)
+    whole = planes_through(points[:, : counts.min()])
+    assert whole.middles == pytest.approx(points[:, : counts.min()].mean(axis=1), abs=1e-9)
+    assert len(planes_through(np.zeros((0, count, 3))).normals) == 0

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.maps.ikd_tree.tree import IkdTree
+from boxplus.maps.plane_fit import planes_through
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 
 Floats = NDArray[np.float64]
@@ -65,13 +66,9 @@ def _normals(points: NDArray[np.float32]) -> Floats:
         return np.zeros((0, 3))
     chosen = points[:: max(len(points) // _SAMPLES, 1)].astype(np.float64)
     found = IkdTree(points, rebuild="inplace").nearest(chosen, _NEIGHBOURS, max_distance=_REACH)
-    near, counts = found.points[found.counts >= _FEWEST_NEIGHBOURS], found.counts[found.counts >= _FEWEST_NEIGHBOURS]
-    is_there = (np.arange(_NEIGHBOURS) < counts[:, None])[:, :, None]
-    mean = np.where(is_there, near, 0.0).sum(axis=1, keepdims=True) / counts[:, None, None]
-    near = np.where(is_there, near - mean, 0.0)
-    spread, axes = np.linalg.eigh(np.swapaxes(near, 1, 2) @ near)
-    is_flat = spread[:, 0] < _FLAT**2 * spread[:, 1]
-    return np.asarray(axes[is_flat, :, 0])
+    enough = found.counts >= _FEWEST_NEIGHBOURS
+    planes = planes_through(found.points[enough], found.counts[enough])
+    return np.asarray(planes.normals[planes.thickness_sq < _FLAT**2 * planes.width_sq])
 
 
 def _off(normals: Floats, up: Floats) -> tuple[NDArray[np.bool_], Floats]:

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_fit import planes_through
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import middle_of
 
 _SCANS, _MOST_MAP_POINTS, _MOST_POINTS = 12, 5000, 4000
@@ -154,11 +155,9 @@ def plane_normals(tree: IkdTree) -> NDArray[np.float64]:
     points = points[:: max(len(points) // _MOST_POINTS, 1)]
     neighbours = tree.nearest(points, _NEIGHBOURS).points
     full = np.isfinite(neighbours).all(axis=(1, 2))
-    near = neighbours[full] - neighbours[full].mean(axis=1, keepdims=True)
-    variance, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near) / _NEIGHBOURS)
-    plane = (variance[:, 0] < _THICKEST_M**2) & (variance[:, 0] < _FLAT * variance[:, 1])
-    normals: NDArray[np.float64] = vectors[plane, :, 0]
-    return normals
+    planes = planes_through(neighbours[full])
+    flat = (planes.thickness_sq < _THICKEST_M**2) & (planes.thickness_sq < _FLAT * planes.width_sq)
+    return np.asarray(planes.normals[flat])
 
 
 def plane_directions(normals: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], float]]:

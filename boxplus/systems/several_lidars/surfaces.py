@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.maps.plane_fit import planes_through
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 
 _VOXEL_M = 0.25
@@ -35,11 +36,10 @@ class Surfaces:
 
         distances, index = KDTree(centroids).query(centroids, _NEIGHBOURS, distance_upper_bound=_REACH_M)
         around = centroids[index[np.isfinite(distances[:, -1])]]
-        centred = around - around.mean(axis=1, keepdims=True)
-        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred) / _NEIGHBOURS)
-        thick, spread = np.sqrt(np.maximum(values[:, 0], 0.0)), np.sqrt(np.maximum(values[:, 1], 0.0))
+        planes = planes_through(around)
+        thick, spread = np.sqrt(planes.thickness_sq), np.sqrt(planes.width_sq)
         flat = (spread > _LEAST_SPREAD_M) & (thick < _THICKEST_M) & (thick < _FLATNESS * spread)
-        self._centres, self._normals = around.mean(axis=1)[flat], vectors[flat, :, 0]
+        self._centres, self._normals = planes.middles[flat], planes.normals[flat]
         self.count = int(flat.sum())
         self._tree = KDTree(self._centres) if self.count else None
 

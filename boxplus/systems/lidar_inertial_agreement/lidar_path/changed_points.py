@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_fit import planes_through
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import (
     Turning,
@@ -149,12 +150,10 @@ def _unexplained(p: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[
     unexplained: NDArray[np.bool_] = np.asarray(np.linalg.norm(p, axis=1) < FAR_M)
     away = np.asarray(np.linalg.norm(neighbours[:, 0] - p, axis=1))
     near = full & (away < NEAR_M)
-    middle = neighbours[near].mean(axis=1)
-    spread = neighbours[near] - middle[:, None]
-    variance, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread) / NEIGHBOURS)
-    flat = (variance[:, 0] < _THICKEST_M**2) & (variance[:, 0] < _FLAT * variance[:, 1])
+    planes = planes_through(neighbours[near])
+    flat = (planes.thickness_sq < _THICKEST_M**2) & (planes.thickness_sq < _FLAT * planes.width_sq)
     on_plane = np.zeros(len(p), bool)
-    on_plane[near] = flat & (np.abs(np.einsum("ni,ni->n", vectors[:, :, 0], p[near] - middle)) < _SAME_M)
+    on_plane[near] = flat & (np.abs(np.einsum("ni,ni->n", planes.normals, p[near] - planes.middles)) < _SAME_M)
     unexplained &= ~(full & (away < _SAME_M)) & ~on_plane
     return unexplained
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_fit import planes_through
 
 _MANY = 15
 _THICKEST_M, _FLAT = 0.06, 0.05
@@ -36,16 +37,14 @@ def surface_distances(
     full = np.asarray(np.isfinite(neighbours).all(axis=(1, 2)))
     near = full.copy()
     near[full] = np.linalg.norm(neighbours[full, 0] - points[full], axis=1) < _NEAR_M
-    middle = neighbours[near].mean(axis=1)
-    spread = neighbours[near] - middle[:, None]
-    variance, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread) / _MANY)
-    flat = (variance[:, 0] < _THICKEST_M**2) & (variance[:, 0] < _FLAT * variance[:, 1])
+    planes = planes_through(neighbours[near])
+    flat = (planes.thickness_sq < _THICKEST_M**2) & (planes.thickness_sq < _FLAT * planes.width_sq)
     surface = near.copy()
     surface[near] = flat
     normals = np.zeros((len(points), 3))
-    normals[surface] = vectors[flat, :, 0]
+    normals[surface] = planes.normals[flat]
     distances = np.zeros(len(points))
-    distances[surface] = np.abs(np.einsum("ni,ni->n", vectors[flat, :, 0], points[surface] - middle[flat]))
+    distances[surface] = np.abs(np.einsum("ni,ni->n", planes.normals[flat], points[surface] - planes.middles[flat]))
     return near, surface, distances, normals
 
 
