@@ -29,7 +29,8 @@ from boxplus.systems.lidar_inertial_agreement.corrected_points import CorrectedP
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import surer_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, with_cells_for_all
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
 from boxplus.systems.lidar_inertial_agreement.rotation import SCALE, RotationFit, compare_rotations

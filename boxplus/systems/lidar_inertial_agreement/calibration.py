@@ -25,7 +25,7 @@ from boxplus.manifolds import so3
 from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 
 _PIECE_S = 2.0
 _FEWEST_POSES = 6

@@ -19,7 +19,7 @@ from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns
 from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surfaces_across
 

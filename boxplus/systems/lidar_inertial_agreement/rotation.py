@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from boxplus.manifolds import so3
 from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
 from boxplus.sensors.inertial.imu import ImuSamples
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 
 _LARGEST_OFFSET_S = 0.6
 _OFFSET_KNOWN_S = 0.012

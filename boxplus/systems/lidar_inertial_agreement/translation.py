@@ -23,7 +23,7 @@ from boxplus.filtering.nav_state import STANDARD_GRAVITY
 from boxplus.manifolds import so3
 from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
 from boxplus.sensors.inertial.imu import ImuSamples
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 
 _FEWEST_POSES = 6  # of a stretch
 _SIGMA_M = 0.004  # of a pose by registration

@@ -29,7 +29,7 @@ from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     slope_of,
 )
 from boxplus.systems.lidar_inertial_agreement.lengths import FEWEST_SLOPES, lengths_known, lengths_of_many
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned
 from boxplus.systems.lidar_inertial_agreement.mounting_in_use import mounting_in_use, shows_about
 from boxplus.systems.lidar_inertial_agreement.mountings import Turn, mounting_of_many, turn_from

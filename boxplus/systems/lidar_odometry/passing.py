@@ -23,7 +23,7 @@ from boxplus.maps.local_maps.vertical import find_vertical
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import CommonMotion, common_motion
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import turning_through
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Poses
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import Poses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
 from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surfaces_across
 from boxplus.systems.lidar_odometry.motion import MotionState

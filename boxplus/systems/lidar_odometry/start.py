@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from boxplus.manifolds import so3
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import one_speed, well_known
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_odometry.motion import MotionBetween, MotionState
 from boxplus.systems.lidar_odometry.passing import passing_motion, turning_along
 

@@ -17,7 +17,7 @@ from boxplus.simulation.faults import Event
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.scenarios import mounting
 from boxplus.simulation.worlds import worlds
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import Twist
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 CONFIG = LioConfig()  # type: ignore[call-arg]

@@ -7,7 +7,7 @@ import pytest
 
 from boxplus.manifolds import so3
 from boxplus.sensors.inertial.imu import ImuSamples
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
 
 STEP_S = 0.1

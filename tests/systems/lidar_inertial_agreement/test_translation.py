@@ -10,7 +10,7 @@ from scipy import stats
 
 from boxplus.filtering.nav_state import STANDARD_GRAVITY
 from boxplus.sensors.inertial.imu import ImuSamples
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.translation import TranslationFit, compare_accelerations, few_groups, wide_prior
 from tests.systems.lidar_inertial_agreement.lidar_path.test_explained_scans import true_path
 from tests.systems.lidar_inertial_agreement.small_platforms import data, handheld

@@ -17,7 +17,8 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import 
     other_explains_better,
     scans_of,
 )
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
 
 _ABOUT_THE_SAME = 0.1, 0.5  # rad and m: drift over some seconds

@@ -22,7 +22,7 @@ from boxplus._words import signed
 from boxplus.manifolds import so3
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import ChangedPoints, changed_points
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
 from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import (
     ASIDE_M,

@@ -9,7 +9,7 @@ determine stays without information, whatever number the registration has come t
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,11 @@ from boxplus.maps.plane_measurement import REASONS, PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.sensors.lidar.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import (
     FEWEST_USED,
     GOOD_MISFIT_M,
+    SETTLED,
     Turning,
     align,
     honest_information,
@@ -44,70 +46,16 @@ _PASSES = 3  # undistort, register: the motion found undistorts better than the 
 _WEAK = 0.7
 _INDEPENDENT_M = 0.5  # between points whose errors are independent
 _SAME_MOTION = 2e-3  # rad and m between passes
+_COARSE, _FEW = 3, 300  # every so many points are enough for a first pass, where so many stay
+_ROUGHLY = 2e-3  # rad and m of the last step of a first pass, which a wrong motion has undistorted
 _FASTEST = 35.0, 70.0  # rad/s, m/s: beyond it a registration has gone astray
 _LEAST_SHARE = 0.1  # of the points lie on the map, or the scan is not registered; in an open field a fifth of them do at rest
 _SAME_START = 0.005, 0.02  # rad and m between two expectations
+_SAME_POSE = 0.002, 0.005  # rad and m between what first passes have come to
 _FIRST_SPEEDS = 5.0, 10.0  # m/s, both ways along every axis
 _MOST_SEARCHES = 3  # failures after which no speed is tried any more: it is not the speed
 _POOR = 1.5  # times the usual misfit: worth another guess
 _LONGEST_STEP_S = 1.0
-
-_OF_POSES = ("time_ns", "R_path_lidar", "p_path_lidar", "information", "segment", "weak", "misfit", "cost")
-
-
-Poses = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
-"""Times (K,) [ns], attitudes (K, 3, 3) and positions (K, 3) [m] of the LiDAR, in any frame."""
-
-
-@dataclass(frozen=True, slots=True)
-class LidarPath:
-    """Poses of the LiDAR at the middles of scans. Where a registration failed a new segment begins, without a tie.
-
-    Attributes:
-        time_ns: (K,) int64.
-        R_path_lidar: (K, 3, 3) float64; p_path_lidar: (K, 3) float64 [m]; the path's frame is the first pose of the segment.
-        information: (K, 6, 6) float64 about a pose [θ about the LiDAR's axes, p along the path's]; nothing along what the scene
-            does not determine. The first pose of a segment defines its frame and has none.
-        segment: (K,) int64.
-        weak: (K,) bool, whether the scene left a direction undetermined.
-        misfit: (K,) float64, rms distance of the points from their planes [m].
-        cost: (K,) float64, mean squared distance, points without a plane counted as far off [m²].
-        failed: scans that could not be registered.
-        scan_s: how long a scan lasts, over which a pose is the mean of where the LiDAR was; 0 for poses at instants [s].
-    """
-
-    time_ns: NDArray[np.int64]
-    R_path_lidar: NDArray[np.float64]
-    p_path_lidar: NDArray[np.float64]
-    information: NDArray[np.float64]
-    segment: NDArray[np.int64]
-    weak: NDArray[np.bool_]
-    misfit: NDArray[np.float64]
-    cost: NDArray[np.float64]
-    failed: int
-    scan_s: float = 0.0
-
-    def __len__(self) -> int:
-        return len(self.time_ns)
-
-    @property
-    def poses(self) -> Poses:
-        """Times, attitudes and positions."""
-        return self.time_ns, self.R_path_lidar, self.p_path_lidar
-
-    def packed(self, k: int) -> NDArray[np.float64]:
-        """The packed state (36,) of a LiDAR at the k-th pose."""
-        x = NavState.identity().pack()
-        x[R : R + 9], x[P : P + 3] = self.R_path_lidar[k].ravel(), self.p_path_lidar[k]
-        return x
-
-    def part(self, chosen: NDArray[np.bool_]) -> LidarPath:
-        """The poses that are chosen (K,)."""
-        return replace(self, **{name: getattr(self, name)[chosen] for name in _OF_POSES})
-
-
-Twist = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Turn rate (3,) [rad/s] and velocity (3,) [m/s] of the LiDAR, both in its own frame."""
 
 
 def lidar_path(
@@ -306,10 +254,11 @@ class LidarMotion:
         if expected is None:  # who has an estimate needs no search
             starts += [(0.3 * self._rate, 0.3 * self._velocity), (self._rate, 2.0 * self._velocity)]
         best: _Fit | None = None
+        reached: list[NDArray[np.float64]] | None = None if expected is None else []
         for number, (rate, velocity) in enumerate(starts):
             if number >= needed and best is not None and best.misfit < max(_POOR * self._usual, GOOD_MISFIT_M):
                 break
-            found = self._register(scan, middle_ns, step_s, rate, velocity)
+            found = self._register(scan, middle_ns, step_s, rate, velocity, reached)
             if found is not None and (best is None or found.cost < best.cost):
                 best = found
         return best
@@ -318,31 +267,51 @@ class LidarMotion:
         return nodes_within(scan, at_ns, rate, velocity, self._guesses[0] if self._undistort else None)
 
     def _register(
-        self, scan: Scan, middle_ns: int, step_s: float, rate: NDArray[np.float64], velocity: NDArray[np.float64]
+        self,
+        scan: Scan,
+        middle_ns: int,
+        step_s: float,
+        rate: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        reached: list[NDArray[np.float64]] | None = None,
     ) -> _Fit | None:
+        """The registration from one expected motion; None where it fails, or goes the way of one before.
+
+        Args:
+            reached: packed states (36,) that others have come to; those of this one are added. Given by who has an estimate, and
+                begins close by: then fewer points and steps are enough for the first pass, and a start ends where another has
+                been, as nothing but the state tells what follows. Without one, in poor surroundings, the last centimetre counts.
+        """
         R_before, p_before = self._x[R : R + 9].reshape(3, 3), self._x[P : P + 3]
         x = self._x.copy()
         x[R : R + 9] = (R_before @ so3.exp(rate * step_s)).ravel()
         x[P : P + 3] = p_before + velocity * step_s
         directions: PoseDirections | None = None
         held = velocity / np.linalg.norm(velocity) if self._held and velocity.any() else None
-        for _ in range(_PASSES):
+        for number in range(_PASSES):
             # Within the scan the motion is what it was found to be on the way here.
             nodes = self._nodes(scan, middle_ns, rate, x[R : R + 9].reshape(3, 3).T @ velocity)
             still = undistorted(scan, nodes, middle_ns)
             points = self._filter(still)[0]
+            roughly = number == 0 and reached is not None
+            if roughly and len(points) >= _FEW * _COARSE:
+                points = points[::_COARSE].copy()
             # Points close together share what is wrong with their surface: finer voxels give more of them, not more information.
             share = min(1.0, self._filter.voxel_size / _INDEPENDENT_M) ** 2
             measurement = PlaneMeasurement(points, self._tree, self._config, with_extrinsic=False, weight=share)
-            directions = align(x, measurement, self._config, held=held)
+            directions = align(x, measurement, self._config, held=held, settled=_ROUGHLY if roughly else SETTLED)
             if directions is None:
                 return None
+            if reached is not None:
+                if roughly and any(_same_pose(x, other) for other in reached):
+                    return None
+                reached.append(x.copy())
             moved = so3.log(R_before.T @ x[R : R + 9].reshape(3, 3)) / step_s, (x[P : P + 3] - p_before) / step_s
             change = max(np.abs(moved[0] - rate).max(), np.abs(moved[1] - velocity).max()) * step_s
             rate, velocity = moved
-            if change < _SAME_MOTION:
+            if change < _SAME_MOTION and not roughly:
                 break
-        information = measurement.at(x, rematch=True)
+        information = measurement.at(x, rematch=reached is None or measurement.has_moved(x))
         # A point among map points of one scan line is not used, but it does lie on the map.
         on_line = measurement.rejected().get(REASONS[ONE_LINE], 0)
         share = (information.used + on_line) / max(len(points), 1)
@@ -365,6 +334,12 @@ class LidarMotion:
             cost,
             self._map_filter(still)[1],
         )
+
+
+def _same_pose(x: NDArray[np.float64], y: NDArray[np.float64]) -> bool:
+    """Whether two packed states (36,) are so near that the same comes of both."""
+    turned = so3.log(x[R : R + 9].reshape(3, 3).T @ y[R : R + 9].reshape(3, 3))
+    return bool(np.abs(turned).max() < _SAME_POSE[0] and np.abs(x[P : P + 3] - y[P : P + 3]).max() < _SAME_POSE[1])
 
 
 @dataclass(frozen=True, slots=True)

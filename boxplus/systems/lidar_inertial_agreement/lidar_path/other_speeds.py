@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 
 _SURE_M = 0.006  # standard deviation of a pose, along all axes, below which no other minimum is looked for

@@ -20,7 +20,7 @@ from boxplus.sensors.lidar.scan import Scan
 GOOD_MISFIT_M = 0.06  # of a registration that needs no second start
 FEWEST_USED = 60  # points on planes, or a scan is not registered
 _STEPS = 12
-_SETTLED = 2e-4  # rad and m
+SETTLED = 2e-4  # rad and m of the last step
 _SIGMA_FLOOR = np.repeat([3e-4, 3e-3], 3)  # rad, m: surfaces are no planes, and neighbouring points share their errors
 
 _ENOUGH = 2.5 * FEWEST_USED  # points of a thinned scan: not all of them lie on planes
@@ -65,10 +65,11 @@ def align(
     *,
     steps: int = _STEPS,
     held: NDArray[np.float64] | None = None,
+    settled: float = SETTLED,
 ) -> PoseDirections | None:
     """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. None when too few points match.
 
-    Along a unit axis `held` (3,), frame of the map, the position stays where it is.
+    Along a unit axis `held` (3,), frame of the map, the position stays where it is. The last step is below `settled` [rad and m].
     """
     delta = np.zeros(TANGENT)
     directions: PoseDirections | None = None
@@ -83,7 +84,7 @@ def align(
             A[3:6, 3:6] += _STIFF * float(np.trace(A[3:6, 3:6])) * np.outer(held, held)
         delta[:6] = strong_step(A, information.b, directions)
         boxplus_into(x, delta, x)
-        if np.abs(delta).max() < _SETTLED:
+        if np.abs(delta).max() < settled:
             break
     return directions
 

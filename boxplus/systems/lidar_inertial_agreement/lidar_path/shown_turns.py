@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from boxplus.manifolds import so3
 from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
 from boxplus.sensors.inertial.imu import ImuSamples
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 
 KNOWN_RAD = 0.02  # standard deviation of an attitude that is known
 _BY_GYROSCOPE_RAD = 0.015  # the same of one that a gyroscope has carried on, on average over a second at a bias of 0.03 rad/s

@@ -13,7 +13,7 @@ from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import Frame, joined_imu
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from boxplus._words import signed
 from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import changed_share
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import common_motion
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, Twist, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
     least_known_axis,
     mean_velocity,
     one_speed,
     well_known,
 )
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest
 from boxplus.systems.lidar_inertial_agreement.rest import Rest

@@ -23,7 +23,7 @@ from boxplus.manifolds import so3
 from boxplus.manifolds.upright_rotation import upright_rotation
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns
 from boxplus.systems.lidar_inertial_agreement.translation import (
     ARM,

@@ -16,7 +16,7 @@ from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import speaks_against
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
     least_known_axis,
     mean_velocity,
@@ -24,6 +24,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
     other_speed,
     well_known,
 )
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns, turned_by_gyroscope
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, faces, judge_rest

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from boxplus.filtering.nav_state import BA, BW, T_BA, T_BW, T_THETA_L, TANGENT, R, V, boxminus_into
 from boxplus.manifolds import so3
 from boxplus.sensors.sequencer import Frame
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import Twist
 from boxplus.systems.lidar_inertial_agreement.shown import Shown
 from boxplus.systems.lidar_inertial_agreement.watch import Watch
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig

@@ -24,7 +24,8 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import (
     speaks_against,
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, true_poses, true_twists
 

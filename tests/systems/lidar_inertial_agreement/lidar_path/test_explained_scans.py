@@ -16,7 +16,8 @@ from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import lidar_path_backwards, surer_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for_all
 from boxplus.systems.lidar_inertial_agreement.rotation import compare_rotations
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, true_poses, true_twists

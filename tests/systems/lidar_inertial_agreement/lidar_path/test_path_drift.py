@@ -9,7 +9,7 @@ import pytest
 
 from boxplus.manifolds import so3
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path_drift import path_drift
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG
 

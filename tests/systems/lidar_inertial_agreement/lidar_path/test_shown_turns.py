@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns, turned_by_gyroscope
 from boxplus.systems.lidar_inertial_agreement.translation import compare_accelerations, wide_prior
 from tests.systems.lidar_inertial_agreement.lidar_path.test_explained_scans import true_path
