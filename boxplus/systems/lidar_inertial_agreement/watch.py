@@ -19,7 +19,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
-from boxplus.systems.lidar_inertial_agreement.finding import Finding
+from boxplus.systems.lidar_inertial_agreement.finding import Cause, Finding
 from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     contradictions,
     judges,
@@ -46,6 +46,9 @@ _DECIDED_EVERY_S = (8.0, 8.0, 16.0, 20.0)
 _SUSPECTED_EVERY_S = 2.0
 _MOST_SLOPES = 6  # that are asked for sooner than what is decided
 _OF_ACCELERATIONS = ("length_scale", "force_sign")  # causes that leave rotations as they are
+# Registrations that went astray turn like nothing else, or twice as far: once is not enough to part two sensors, or for a scale
+# that no unit explains. Speeding up beside traffic that goes along, rings made the turns of a car twice what they were.
+_SAID_TWICE: tuple[Cause, ...] = ("not_together", "gyro_scale")
 
 
 class Watch:
@@ -76,7 +79,7 @@ class Watch:
         self._suspected_ns = 0
         self._take_up_after = _TAKEN_UP_AFTER
         self._decided = 0
-        self._doubted = False
+        self._doubted: Finding | None = None
         self._astray: Finding | None = None
         self._blind_scans = 0
         self._T_last: NDArray[np.float64] | None = None
@@ -141,13 +144,18 @@ class Watch:
         return news
 
     def finish(self) -> str | None:
-        """No more scans will come: take up what is still under way, and compare the last scans if nothing has decided yet."""
+        """No more scans will come: take up what is still under way, and compare the last scans if nothing has decided yet.
+
+        A scale that the only comparison which could decide has found is said, as no other will.
+        """
         news = None
         if self._pending is not None:
             news = self._take_up(self._pending.result())
             self._pending = None
         if not self._decided and len(self._scans) >= _FEWEST_SCANS and not self._blind_scans and self._T_last is not None:
             news = self._take_up(self._comparison(self._T_last)()) or news
+        if self._decided == 1 and self._doubted is not None and self.contradiction is None:
+            self.contradiction, news = self._doubted, self._doubted.text
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
@@ -168,9 +176,9 @@ class Watch:
         other_mounting = self._by_all_stretches(agreement, findings)
         if other_mounting is not None or (shows_mounting(agreement) and not findings):
             self.mounting_borne_out = other_mounting is None
-        # Registrations that went astray turn like nothing else either: once is not enough to part two sensors.
-        doubted, self._doubted = self._doubted, bool(findings) and findings[0].cause == "not_together"
-        if self._doubted and not doubted:
+        said = [finding.cause for finding in (self._doubted, self.contradiction) if finding is not None]
+        self._doubted = findings[0] if findings and findings[0].cause in _SAID_TWICE else None
+        if self._doubted is not None and self._doubted.cause not in said:
             findings = []
         drift = self._drift(agreement)
         if drift is not None:
@@ -185,15 +193,16 @@ class Watch:
         end_ns = int(agreement.path.time_ns[-1]) if len(agreement.path) else 0
         wait, news = _UNDECIDED_EVERY_S, None
         if decisive:
-            if not 0 < len(self._slopes.said) < _MOST_SLOPES or lengths_known(self._slopes.said):
+            asks_lengths = 0 < len(self._slopes.said) < _MOST_SLOPES and not lengths_known(self._slopes.said)
+            if not asks_lengths and self._doubted is None:
                 wait = _DECIDED_EVERY_S[min(self._decided, len(_DECIDED_EVERY_S) - 1)]
             self._decided += 1
-            before = self.contradiction
-            if findings and (before is None or findings[0].cause != before.cause):
+            named = self.contradiction
+            if findings and (named is None or findings[0].cause != named.cause):
                 self.contradiction = news = findings[0]
             elif findings and findings[0].axis is not None:
                 self.contradiction = findings[0]  # a mounting that is being corrected: about the axis it is off now
-            elif not findings and before is not None and _clears(before, agreement):
+            elif not findings and named is not None and self._doubted is None and _clears(named, agreement):
                 self.contradiction = self._astray  # a position once lost is not found again by moving rightly
         self._due_ns = end_ns + round(wait * 1e9)
         return None if news is None else news.text

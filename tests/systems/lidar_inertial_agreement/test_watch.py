@@ -48,6 +48,47 @@ def test_a_length_that_one_stretch_asks_for_and_the_others_do_not_is_none(monkey
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scales", "named", "stays"),
+    [
+        ((0.5, 1.0, 1.0), False, False),
+        ((1.0, 0.5, 1.0, 0.5), False, False),
+        ((0.5, 0.5, 1.0), True, False),
+        ((0.5, 0.5, None, 0.5), True, True),  # None: nothing turned
+        ((0.5,), True, True),
+    ],
+)
+def test_a_gyroscope_s_scale_is_said_by_two_comparisons(
+    monkeypatch: pytest.MonkeyPatch, scales: tuple[float | None, ...], named: bool, stays: bool
+) -> None:
+    simulation = handheld(4)
+    T = simulation.T_imu_lidar
+    scans, imu = data(simulation)
+    seen = compare_sensors(scans[:25], imu, CONFIG, T_declared=T)
+    assert seen.rotation is not None
+    rotation = replace(seen.rotation, explained=0.99)
+    assert [finding.cause for finding in contradictions(replace(seen, rotation=replace(rotation, scale=0.5)), T)] == [
+        "gyro_scale"
+    ]
+    following_scales = iter(scales)
+    last = scales[-1]
+
+    def compare(scans: Sequence[Scan], *_: Any, **__: Any) -> Agreement:
+        time_ns = np.linspace(scans[0].start_ns, scans[-1].end_ns, len(seen.path)).astype(np.int64)
+        scale = next(following_scales, last)
+        fit = None if scale is None else replace(rotation, scale=scale)
+        return replace(seen, path=replace(seen.path, time_ns=time_ns), rotation=fit, translation=None)
+
+    monkeypatch.setattr(watch, "compare_sensors", compare)
+    following = watch.Watch(CONFIG, T)
+    still = np.zeros(3), np.zeros(3)
+    said = [following.add(scans[0].shifted(k * 100_000_000), imu, T, still) for k in range(75 * len(scales))]
+    said.append(following.finish())
+    assert any(text is not None and "times as far as the LiDAR" in text for text in said) == named
+    assert (following.contradiction is not None) == stays
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("slope", "named"), [(0.88, True), (1.12, True), (0.96, False)])
 def test_lengths_are_named_by_several_comparisons(monkeypatch: pytest.MonkeyPatch, slope: float, named: bool) -> None:
     simulation = handheld(4)
