@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.errors import InputError
 from boxplus.filtering.small_linalg import symmetric_eigen_into
 
 COINCIDENT_M = 1e-6
@@ -91,13 +92,25 @@ class Planes(NamedTuple):
 
 
 def planes_through(points: NDArray[np.float64], counts: NDArray[np.int64] | None = None) -> Planes:
-    """The planes through handfuls of points (N, k, 3), of each the first `counts` (N,), one at least; all when not given.
+    """The planes through handfuls of points (N, k, 3) [m], in any frame, of each the first `counts` (N,); all when not given.
 
     Where the points lie on a line or in one place, the normal is any across them.
+
+    Raises:
+        InputError: a handful of none, or of more than k.
+
+    Example:
+        >>> square = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 2.0], [1.0, 1.0, 2.0], [0.0, 1.0, 2.0]])
+        >>> found = planes_through(square[None])
+        >>> abs(found.normals[0]).tolist(), found.middles[0].tolist()
+        ([0.0, 0.0, 1.0], [0.5, 0.5, 2.0])
     """
     n, k = points.shape[:2]
+    counts = np.full(n, k) if counts is None else counts
+    if n and not 1 <= counts.min() <= counts.max() <= k:
+        raise InputError(f"1 to {k} points of each plane", f"{counts.min()} to {counts.max()}", "leave out those without any")
     found = Planes(np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n))
-    _planes_into(np.ascontiguousarray(points), np.full(n, k) if counts is None else counts, *found)
+    _planes_into(np.ascontiguousarray(points), counts, *found)
     return found
 
 

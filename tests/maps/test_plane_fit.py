@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba.core import config as numba_config
 
+from boxplus.errors import InputError
 from boxplus.maps.plane_fit import COLLINEAR_RATIO, fit_plane_into, planes_through
 
 LIMIT = 0.1
@@ -135,3 +136,9 @@ def test_planes_through_handfuls_against_eigenvalues(seed: int, noise: float, co
     whole = planes_through(points[:, : counts.min()])
     assert whole.middles == pytest.approx(points[:, : counts.min()].mean(axis=1), abs=1e-9)
     assert len(planes_through(np.zeros((0, count, 3))).normals) == 0
+
+
+@pytest.mark.parametrize("count", [0, 4])
+def test_handfuls_of_no_points_or_of_more_than_there_are_are_refused(count: int) -> None:
+    with pytest.raises(InputError, match="expected 1 to 3 points of each plane"):
+        planes_through(np.ones((2, 3, 3)), np.array([3, count]))

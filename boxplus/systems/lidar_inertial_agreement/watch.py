@@ -19,12 +19,14 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
-from boxplus.systems.lidar_inertial_agreement.finding import Cause, Finding
+from boxplus.systems.lidar_inertial_agreement.finding import Finding
 from boxplus.systems.lidar_inertial_agreement.hypotheses import (
     contradictions,
     judges,
     judges_clocks,
     judges_rotation,
+    judges_scale,
+    least_scale,
     shows_mounting,
     slope_of,
 )
@@ -46,9 +48,6 @@ _DECIDED_EVERY_S = (8.0, 8.0, 16.0, 20.0)
 _SUSPECTED_EVERY_S = 2.0
 _MOST_SLOPES = 6  # that are asked for sooner than what is decided
 _OF_ACCELERATIONS = ("length_scale", "force_sign")  # causes that leave rotations as they are
-# Registrations that went astray turn like nothing else, or twice as far: once is not enough to part two sensors, or for a scale
-# that no unit explains. Speeding up beside traffic that goes along, rings made the turns of a car twice what they were.
-_SAID_TWICE: tuple[Cause, ...] = ("not_together", "gyro_scale")
 
 
 class Watch:
@@ -79,7 +78,9 @@ class Watch:
         self._suspected_ns = 0
         self._take_up_after = _TAKEN_UP_AFTER
         self._decided = 0
-        self._doubted: Finding | None = None
+        self._doubted = False
+        self._scale: Finding | None = None  # of the gyroscope, said once
+        self._scale_was_right = False
         self._astray: Finding | None = None
         self._blind_scans = 0
         self._T_last: NDArray[np.float64] | None = None
@@ -146,7 +147,7 @@ class Watch:
     def finish(self) -> str | None:
         """No more scans will come: take up what is still under way, and compare the last scans if nothing has decided yet.
 
-        A scale that the only comparison which could decide has found is said, as no other will.
+        A gyroscope's scale that was found once, and never found right, is said: no other comparison will.
         """
         news = None
         if self._pending is not None:
@@ -154,8 +155,8 @@ class Watch:
             self._pending = None
         if not self._decided and len(self._scans) >= _FEWEST_SCANS and not self._blind_scans and self._T_last is not None:
             news = self._take_up(self._comparison(self._T_last)()) or news
-        if self._decided == 1 and self._doubted is not None and self.contradiction is None:
-            self.contradiction, news = self._doubted, self._doubted.text
+        if self._scale is not None and not self._scale_was_right and self.contradiction is None:
+            self.contradiction, news = self._scale, self._scale.text
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
@@ -176,14 +177,16 @@ class Watch:
         other_mounting = self._by_all_stretches(agreement, findings)
         if other_mounting is not None or (shows_mounting(agreement) and not findings):
             self.mounting_borne_out = other_mounting is None
-        said = [finding.cause for finding in (self._doubted, self.contradiction) if finding is not None]
-        self._doubted = findings[0] if findings and findings[0].cause in _SAID_TWICE else None
-        if self._doubted is not None and self._doubted.cause not in said:
+        # Registrations that went astray turn like nothing else either: once is not enough to part two sensors.
+        doubted, self._doubted = self._doubted, bool(findings) and findings[0].cause == "not_together"
+        if self._doubted and not doubted:
             findings = []
         drift = self._drift(agreement)
         if drift is not None:
             findings.insert(0, drift)
-        findings = self._with_lengths(agreement, findings)
+        found = self._with_lengths(agreement, findings)
+        findings = self._without_single_scale(agreement, found)
+        held_back = len(findings) < len(found)
         if other_mounting is not None and not any(finding.cause == "extrinsic" for finding in findings):
             findings.append(other_mounting)
         if agreement.astray is not None:
@@ -194,7 +197,7 @@ class Watch:
         wait, news = _UNDECIDED_EVERY_S, None
         if decisive:
             asks_lengths = 0 < len(self._slopes.said) < _MOST_SLOPES and not lengths_known(self._slopes.said)
-            if not asks_lengths and self._doubted is None:
+            if not asks_lengths and not held_back:
                 wait = _DECIDED_EVERY_S[min(self._decided, len(_DECIDED_EVERY_S) - 1)]
             self._decided += 1
             named = self.contradiction
@@ -202,7 +205,7 @@ class Watch:
                 self.contradiction = news = findings[0]
             elif findings and findings[0].axis is not None:
                 self.contradiction = findings[0]  # a mounting that is being corrected: about the axis it is off now
-            elif not findings and named is not None and self._doubted is None and _clears(named, agreement):
+            elif not findings and not held_back and named is not None and _clears(named, agreement):
                 self.contradiction = self._astray  # a position once lost is not found again by moving rightly
         self._due_ns = end_ns + round(wait * 1e9)
         return None if news is None else news.text
@@ -223,6 +226,22 @@ class Watch:
         if self._T_declared is not None and rotation is not None and sound and judges_rotation(agreement):
             self._turns.add(agreement, turn_from(rotation, self._T_declared[:3, :3]))
         return mounting_of_many(self._turns.said)
+
+    def _without_single_scale(self, agreement: Agreement, findings: list[Finding]) -> list[Finding]:
+        """The findings, without a gyroscope's scale that was not found before, or was found right since.
+
+        Such a scale is wrong all the time. Beside traffic that went along as it sped up, the rings of a car made its turns twice
+        what they were, once; comparisons that do not show a scale say nothing of it.
+        """
+        scale = next((finding for finding in findings if finding.cause == "gyro_scale"), None)
+        if scale is not None:
+            before, self._scale = self._scale, scale
+            known = before is not None or (self.contradiction is not None and self.contradiction.cause == scale.cause)
+            return findings if known else [finding for finding in findings if finding is not scale]
+        rotation = agreement.rotation
+        if rotation is not None and judges_scale(rotation) and abs(rotation.scale - 1.0) < least_scale(rotation):
+            self._scale, self._scale_was_right = None, True
+        return findings
 
     def _with_lengths(self, agreement: Agreement, findings: list[Finding]) -> list[Finding]:
         """The findings, with what all stretches so far say of the lengths.

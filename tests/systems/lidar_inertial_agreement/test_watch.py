@@ -55,7 +55,11 @@ def test_a_length_that_one_stretch_asks_for_and_the_others_do_not_is_none(monkey
         ((1.0, 0.5, 1.0, 0.5), False, False),
         ((0.5, 0.5, 1.0), True, False),
         ((0.5, 0.5, None, 0.5), True, True),  # None: nothing turned
+        ((0.5, None, 0.5), True, True),
+        ((0.5, -0.5, 0.5), True, True),  # negative: the scale is not known well enough
         ((0.5,), True, True),
+        ((None, 0.5, None), True, True),
+        ((1.0, 0.5), False, False),  # once right, once not
     ],
 )
 def test_a_gyroscope_s_scale_is_said_by_two_comparisons(
@@ -76,7 +80,7 @@ def test_a_gyroscope_s_scale_is_said_by_two_comparisons(
     def compare(scans: Sequence[Scan], *_: Any, **__: Any) -> Agreement:
         time_ns = np.linspace(scans[0].start_ns, scans[-1].end_ns, len(seen.path)).astype(np.int64)
         scale = next(following_scales, last)
-        fit = None if scale is None else replace(rotation, scale=scale)
+        fit = None if scale is None else replace(rotation, scale=abs(scale), explained=0.99 if scale > 0.0 else 0.93)
         return replace(seen, path=replace(seen.path, time_ns=time_ns), rotation=fit, translation=None)
 
     monkeypatch.setattr(watch, "compare_sensors", compare)

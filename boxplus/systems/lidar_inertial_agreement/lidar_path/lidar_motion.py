@@ -27,7 +27,6 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, 
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import (
     FEWEST_USED,
     GOOD_MISFIT_M,
-    SETTLED,
     Turning,
     align,
     honest_information,
@@ -102,6 +101,7 @@ class LidarMotion:
         held: bool = False,
     ) -> None:
         self._config = config.model_copy(update={"weak_threshold": min(config.weak_threshold, _WEAK)})
+        self._of_few = self._config.model_copy(update={"min_points": max(config.min_points, FEWEST_USED)})
         self._guesses = tuple(guesses)
         self._undistort, self._held = undistort and bool(guesses), held
         self._filter = VoxelFilter(max(config.scan_voxel, config.map_cell), MOST_POINTS)
@@ -254,7 +254,7 @@ class LidarMotion:
         if expected is None:  # who has an estimate needs no search
             starts += [(0.3 * self._rate, 0.3 * self._velocity), (self._rate, 2.0 * self._velocity)]
         best: _Fit | None = None
-        reached: list[NDArray[np.float64]] | None = None if expected is None else []
+        reached: list[NDArray[np.float64]] | None = None if expected is None or self._held else []
         for number, (rate, velocity) in enumerate(starts):
             if number >= needed and best is not None and best.misfit < max(_POOR * self._usual, GOOD_MISFIT_M):
                 break
@@ -262,6 +262,19 @@ class LidarMotion:
             if found is not None and (best is None or found.cost < best.cost):
                 best = found
         return best
+
+    def _measurement(self, points: NDArray[np.float32]) -> PlaneMeasurement:
+        # Points close together share what is wrong with their surface: finer voxels give more of them, not more information.
+        share = min(1.0, self._filter.voxel_size / _INDEPENDENT_M) ** 2
+        return PlaneMeasurement(points, self._tree, self._config, with_extrinsic=False, weight=share)
+
+    def _roughly(self, x: NDArray[np.float64], points: NDArray[np.float32]) -> PoseDirections | None:
+        """The first pass with some of the points, x (36,) in place; None, and x stays, where too few of them lie on the map."""
+        near = x.copy()
+        directions = align(near, self._measurement(points[::_COARSE].copy()), self._of_few, settled=_ROUGHLY)
+        if directions is not None:
+            x[:] = near
+        return directions
 
     def _nodes(self, scan: Scan, at_ns: int, rate: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
         return nodes_within(scan, at_ns, rate, velocity, self._guesses[0] if self._undistort else None)
@@ -294,12 +307,10 @@ class LidarMotion:
             still = undistorted(scan, nodes, middle_ns)
             points = self._filter(still)[0]
             roughly = number == 0 and reached is not None
-            if roughly and len(points) >= _FEW * _COARSE:
-                points = points[::_COARSE].copy()
-            # Points close together share what is wrong with their surface: finer voxels give more of them, not more information.
-            share = min(1.0, self._filter.voxel_size / _INDEPENDENT_M) ** 2
-            measurement = PlaneMeasurement(points, self._tree, self._config, with_extrinsic=False, weight=share)
-            directions = align(x, measurement, self._config, held=held, settled=_ROUGHLY if roughly else SETTLED)
+            directions = self._roughly(x, points) if roughly and len(points) >= _FEW * _COARSE else None
+            if directions is None:
+                measurement = self._measurement(points)
+                directions = align(x, measurement, self._config, held=held)
             if directions is None:
                 return None
             if reached is not None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.manifolds import so3
+from boxplus.runs.storage.state_codec import read_state, write_state
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.watches.long_baseline import Drift, LongBaseline
 
@@ -34,8 +37,12 @@ def drive(
     shared: np.ndarray = SMALL,
     seconds: float = 6.0,
     period_s: float = 0.1,
+    checkpoint: tuple[int, Path] | None = None,
 ) -> list[Drift]:
-    """A platform on its way through a box, placed wrongly by drift (6,) a second; `shared`: what all poses share."""
+    """A platform on its way through a box, placed wrongly by drift (6,) a second; `shared`: what all poses share.
+
+    At a `checkpoint`, a scan's number and a file, everything is written and read again.
+    """
     random = np.random.default_rng(seed)
     baseline, found = LongBaseline(LioConfig(threads=1)), []
     x, cov = NavState.identity().pack(), np.zeros((TANGENT, TANGENT))
@@ -54,7 +61,20 @@ def drive(
         if scan == 0:
             datum.widen(shared, x)
         found += [result] if result is not None else []
+        if checkpoint is not None and scan == checkpoint[0]:
+            write_state(checkpoint[1], {"baseline": baseline, "datum": datum})
+            state = read_state(checkpoint[1])
+            baseline, datum = state["baseline"], state["datum"]
     return found
+
+
+@pytest.mark.parametrize("scan", [16, 18, 22, 26])  # of 13 between two marks: with none of the old scans laid down, some, all
+def test_goes_on_from_a_checkpoint_with_the_same_bits(tmp_path: Path, scan: int) -> None:
+    drift = np.array([0.0, 0.0, 0.0, 0.02, 0.0, 0.0])
+    whole, resumed = drive(drift), drive(drift, checkpoint=(scan, tmp_path / "state.npz"))
+    assert len(resumed) == len(whole) > 2
+    for one, other in zip(resumed, whole, strict=True):
+        assert np.array_equal(one.excess, other.excess) and one.deviations == other.deviations > 0.0
 
 
 @pytest.mark.parametrize("seed", [1, 2])
