@@ -42,9 +42,11 @@ from boxplus.systems.pose_graph.doubts.fit import (
     undetermined_notes,
     without_information,
 )
+from boxplus.systems.pose_graph.doubts.fixed_poses import fixed_poses_doubt
 from boxplus.systems.pose_graph.doubts.information_readings import information_doubt, slack_part_notes
 from boxplus.systems.pose_graph.doubts.readings import misreading
 from boxplus.systems.pose_graph.doubts.reliability import Reliability, suspicions
+from boxplus.systems.pose_graph.doubts.wide_rotations import are_wide, wide_notes
 from boxplus.systems.pose_graph.doubts.witnesses import held_against_each_other, lone_joints
 from boxplus.systems.pose_graph.loops import LoopVerdict, judge_loops
 from boxplus.systems.pose_graph.problem import (
@@ -189,7 +191,7 @@ def optimize_pose_graph(
     chosen = min(known, key=lambda name: costs[name])
     prepared = time.perf_counter()
     residual = problem.groups[0].residual
-    verdict = None
+    verdict, is_loud = None, False
     if config.robust == "gnc" and starts.is_loop.any():
         verdict = judge_loops(graph, starts.is_loop, known[chosen], options, callback)
         if config.start == "auto" and not verdict.solution.is_broken_off and verdict.refuses_more_than_noise:
@@ -205,6 +207,8 @@ def optimize_pose_graph(
         squared = squared_errors(residual, graph, solution.values[0])
         first = _fit(graph, squared, None, config, len(held))
         is_loud = config.objective == "logarithm" and turns(residual, graph, solution.values[0]) > _LOUD
+        if config.examine and config.objective == "logarithm" and loss is None and not solution.is_broken_off:
+            is_loud = is_loud or are_wide(solution, poses, first)
         if loss is None and config.start == "auto" and (first.is_doubtful or is_loud):
             enough = first.enough if first.is_doubtful else None
             chosen, solution = starts.further(chosen, solution, known, minima, enough, is_loud=is_loud)
@@ -240,7 +244,8 @@ def optimize_pose_graph(
         reasons += against
     if verdict is None and fit.is_poor:
         told = poor_fit_sentence(fit, minima, len(graph.fixed))
-        bent = fit.is_contradiction and (disagree(minima) or standing_out(squared, graph.information.shape[1]).any())
+        is_local = disagree(minima) and (is_loud or fit.is_contradiction)
+        bent = is_local or (fit.is_contradiction and standing_out(squared, graph.information.shape[1]).any())
         (reasons if bent else notes).append(told)
     examined = time.perf_counter()
     reliability, found = None, []
@@ -254,6 +259,7 @@ def optimize_pose_graph(
             reliability = Reliability.of(with_edges(graph, kept), solution, poses)
             if reliability is not None:
                 found = suspicions(reliability, solution, poses, follow[kept])
+                notes += wide_notes(graph, reliability, fit)
     is_at_end = solution.status == "converged" or solution.limit == "steps"  # a small χ² is none of a start
     if config.examine and verdict is None and loss is None and config.objective == "logarithm" and is_at_end:
         meant = information_doubt(graph, solution, poses, held, options, reliability, callback)
@@ -261,6 +267,11 @@ def optimize_pose_graph(
             reasons.append(meant)
         elif reliability is not None:
             notes += slack_part_notes(reliability)
+    if config.examine and is_at_end and len(graph.fixed) > 1:
+        judged = verdict if loss is None else starts.verdict
+        kept = np.ones(len(graph.edges), dtype=np.bool_) if judged is None else judged.is_kept
+        elsewhere = fixed_poses_doubt(graph, poses_end, kept, options, loss, callback)
+        reasons += [elsewhere] if elsewhere else []
     for one in found:
         (reasons if one.is_grave else notes).append(one.sentence)
     examination = time.perf_counter() - examined

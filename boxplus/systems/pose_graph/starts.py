@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import numpy as np
@@ -147,22 +148,25 @@ class Starts:
         known: dict[Start, NDArray[np.float64]],
         minima: dict[Start, float],
     ) -> tuple[Start, Solution]:
-        """Least squares again from where a Cauchy loss leads from the lowest minimum, while that falls.
+        """Least squares again from where a Cauchy loss leads from the lowest minimum and the chordal start, while that falls.
 
         In a local minimum stretches are wound the wrong way, and hold each other by many edges of which each is off by a little
-        more than noise; once large errors count less, those that are right win.
+        more than noise; once large errors count less, those that are right win. The chordal start has wound nothing yet.
         """
         forgetting, _ = pose_graph_problem(self._graph, held=self._held, loss=Cauchy(_CAUCHY), objective="logarithm")
         watch = named(self._watch, "from another start, cauchy")
-        for _ in range(_ROUNDS):
-            if self._stopped:
-                break
-            left = forgetting.solve(self._options, start=[solution.values[0]], callback=watch).values[0]
-            tried = self._problem.solve(self._options, start=[left], callback=watch)
-            if not tried.cost < (1.0 - _FALLS) * solution.cost:
-                break
-            name, solution = "cauchy", tried
-            known[name], minima[name] = left, 2.0 * tried.cost
+        for origin, reached in ((solution.values[0], solution.cost), (self._chordal_start(), math.inf)):
+            for _ in range(_ROUNDS):
+                if self._stopped:
+                    break
+                left = forgetting.solve(self._options, start=[origin], callback=watch).values[0]
+                tried = self._problem.solve(self._options, start=[left], callback=watch)
+                if not tried.cost < (1.0 - _FALLS) * reached:
+                    break
+                origin, reached = tried.values[0], tried.cost
+                if reached < (1.0 - _FALLS) * solution.cost:
+                    name, solution = "cauchy", tried
+                    known[name], minima[name] = left, 2.0 * reached
         return name, solution
 
     def _make(self, name: Start) -> NDArray[np.float64]:

@@ -1,0 +1,84 @@
+"""Whether the edges agree with the poses that the file fixes, which nothing moves and no edge is doubted for.
+
+Of every piece of the graph one fixed pose holds it, and the others are let go: where the edges then put these has a known
+covariance, and each is held against where the file has it. Held, one that is wrong bends what lies between, and its error is
+spread over so many edges that it looks like noise; graduated non-convexity refuses the loop closures that contradict it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus._chi_square import chi_square_exceeded
+from boxplus.errors import BoxplusError
+from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.manifolds.se2 import SE2
+from boxplus.manifolds.se3 import SE3
+from boxplus.optimization.losses import Loss
+from boxplus.optimization.minimizers.minimize import Callback
+from boxplus.optimization.solver_options import SolverOptions
+from boxplus.systems.pose_graph.doubts.fit import pose_names
+from boxplus.systems.pose_graph.named import named
+from boxplus.systems.pose_graph.problem import edge_parts, pose_graph_problem, with_edges
+from boxplus.systems.pose_graph.start import components
+
+_STRANGE = 1e-4  # chance that the worst of the fixed poses of a sound graph is told
+_LINEAR = 0.3  # [rad] standard deviation of a rotation, up to which the covariance of poses that hang on it is right
+_SPARE = 10  # degrees of freedom from which on errors say how large noise is
+
+
+def fixed_poses_doubt(
+    graph: PoseGraph,
+    poses: NDArray[np.float64],
+    kept: NDArray[np.bool_],
+    options: SolverOptions,
+    loss: Loss | None,
+    callback: Callback | None,
+) -> str | None:
+    """A sentence where the edges put fixed poses elsewhere than the file does.
+
+    Args:
+        graph: edges with information.
+        poses: the result, where least squares begins.
+        kept: (m,) edges that count. loss: of these.
+        callback: may stop the search, which then finds nothing.
+    """
+    part = with_edges(replace(graph, poses=poses), kept)
+    label = components(part)
+    anchors = graph.fixed[np.unique(label[graph.fixed], return_index=True)[1]]
+    judged = np.setdiff1d(graph.fixed, anchors)
+    if not len(judged):
+        return None
+    manifold, dim = (SE3 if graph.dimension == 3 else SE2), graph.information.shape[1]
+    problem, variables = pose_graph_problem(replace(part, fixed=anchors), loss=loss)
+    try:
+        found = problem.solve(options, start=[poses], callback=named(callback, "do the edges agree with fixed poses?"))
+        if found.is_broken_off or found.unconverged() is not None:
+            return None
+        P = found.covariance(variables[judged])
+    except BoxplusError:  # pieces of the graph that only the fixed poses held
+        return None
+    off = manifold.boxminus(poses[judged], found.values[0][judged])
+    turn, shift = edge_parts(dim)
+    spare = dim * (len(part.edges) - len(part.ids) + len(np.unique(label)))
+    scale = max(2.0 * found.cost / spare, 1.0) if spare >= _SPARE else 1.0
+    squared = np.einsum("na,na->n", off, np.linalg.solve(P, off[:, :, None])[:, :, 0]) / scale
+    squared[np.sqrt(np.einsum("nii->ni", P)[:, turn].max(axis=1)) > _LINEAR] = 0.0
+    is_off = squared > chi_square_exceeded(_STRANGE / len(judged), dim)
+    if not is_off.any():
+        return None
+    worst = int(np.argmax(squared))
+    anchor = anchors[label[anchors] == label[judged[worst]]]
+    distance, angle = np.linalg.norm(off[worst, shift]), math.degrees(float(np.linalg.norm(off[worst, turn])))
+    more = np.count_nonzero(is_off) - 1
+    return (
+        f"the edges contradict the poses that the file fixes: as seen from pose {pose_names(graph, anchor)} they put pose "
+        f"{graph.ids[judged[worst]]} {distance:.3g} m and {angle:.3g} deg from where it is fixed, by "
+        f"{math.sqrt(squared[worst]):.3g} standard deviations"
+        + (f", and {more} more elsewhere" if more else "")
+        + ": one of these is wrong, or of another world, or the information of the edges claims too much"
+    )
