@@ -270,7 +270,8 @@ def optimize_pose_graph(
     if config.examine and is_at_end and len(graph.fixed) > 1:
         judged = verdict if loss is None else starts.verdict
         kept = np.ones(len(graph.edges), dtype=np.bool_) if judged is None else judged.is_kept
-        elsewhere = fixed_poses_doubt(graph, poses_end, kept, options, loss, callback)
+        is_loop = None if verdict is None else starts.is_loop
+        elsewhere = fixed_poses_doubt(graph, poses_end, kept, options, loss, callback, is_loop)
         reasons += [elsewhere] if elsewhere else []
     for one in found:
         (reasons if one.is_grave else notes).append(one.sentence)

@@ -22,9 +22,10 @@ from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.pose_graph.doubts.fit import pose_names
+from boxplus.systems.pose_graph.loops import judge_loops
 from boxplus.systems.pose_graph.named import named
 from boxplus.systems.pose_graph.problem import edge_parts, pose_graph_problem, with_edges
-from boxplus.systems.pose_graph.start import components
+from boxplus.systems.pose_graph.start import components, spanning_tree_start
 
 _STRANGE = 1e-4  # chance that the worst of the fixed poses of a sound graph is told
 _LINEAR = 0.3  # [rad] standard deviation of a rotation, up to which the covariance of poses that hang on it is right
@@ -38,6 +39,7 @@ def fixed_poses_doubt(
     options: SolverOptions,
     loss: Loss | None,
     callback: Callback | None,
+    is_loop: NDArray[np.bool_] | None = None,
 ) -> str | None:
     """A sentence where the edges put fixed poses elsewhere than the file does.
 
@@ -45,18 +47,27 @@ def fixed_poses_doubt(
         graph: edges with information.
         poses: the result, where least squares begins.
         kept: (m,) edges that count. loss: of these.
+        is_loop: (m,) edges that graduated non-convexity could refuse; where it did, they are judged once more, without the poses
+            that are let go: a wrong one has the very edges refused that speak against it.
         callback: may stop the search, which then finds nothing.
     """
+    watch = named(callback, "do the edges agree with fixed poses?")
+    anchors = _anchors(graph)
+    if is_loop is not None and not kept.all() and len(anchors) < len(graph.fixed):
+        loose = replace(graph, fixed=anchors)
+        odometry = with_edges(loose, ~is_loop)
+        is_whole = np.array_equal(components(odometry), components(graph))
+        start = spanning_tree_start(odometry) if is_whole else poses
+        kept = judge_loops(loose, is_loop, start, options, watch).is_kept
     part = with_edges(replace(graph, poses=poses), kept)
-    label = components(part)
-    anchors = graph.fixed[np.unique(label[graph.fixed], return_index=True)[1]]
+    anchors, label = _anchors(part), components(part)
     judged = np.setdiff1d(graph.fixed, anchors)
     if not len(judged):
         return None
     manifold, dim = (SE3 if graph.dimension == 3 else SE2), graph.information.shape[1]
     problem, variables = pose_graph_problem(replace(part, fixed=anchors), loss=loss)
     try:
-        found = problem.solve(options, start=[poses], callback=named(callback, "do the edges agree with fixed poses?"))
+        found = problem.solve(options, start=[poses], callback=watch)
         if found.is_broken_off or found.unconverged() is not None:
             return None
         P = found.covariance(variables[judged])
@@ -82,3 +93,8 @@ def fixed_poses_doubt(
         + (f", and {more} more elsewhere" if more else "")
         + ": one of these is wrong, or of another world, or the information of the edges claims too much"
     )
+
+
+def _anchors(graph: PoseGraph) -> NDArray[np.int64]:
+    """The first fixed pose of every piece that has one."""
+    return np.asarray(graph.fixed[np.unique(components(graph)[graph.fixed], return_index=True)[1]])
