@@ -1,8 +1,11 @@
 """Whether the edges agree with the poses that the file fixes, which nothing moves and no edge is doubted for.
 
 Of every piece of the graph one fixed pose holds it, and the others are let go: where the edges then put these has a known
-covariance, and each is held against where the file has it. Held, one that is wrong bends what lies between, and its error is
-spread over so many edges that it looks like noise; graduated non-convexity refuses the loop closures that contradict it.
+covariance, and each is held against where the file has it, which tells whole groups that lie elsewhere. And each is let go alone
+while all others hold (`reactions.py`), which tells single ones, though noise adds up to more on the way from the first.
+
+Held, one that is wrong bends what lies between, and its error is spread over so many edges that it looks like noise; graduated
+non-convexity refuses the loop closures that contradict it.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.systems.pose_graph.doubts.fit import pose_names
+from boxplus.systems.pose_graph.doubts.reactions import Reactions
 from boxplus.systems.pose_graph.loops import judge_loops
 from boxplus.systems.pose_graph.named import named
 from boxplus.systems.pose_graph.problem import edge_parts, pose_graph_problem, with_edges
@@ -71,25 +75,45 @@ def fixed_poses_doubt(
         if found.is_broken_off or found.unconverged() is not None:
             return None
         P = found.covariance(variables[judged])
+        reactions = Reactions.of(part, options, loss, watch)
     except BoxplusError:  # pieces of the graph that only the fixed poses held
         return None
-    off = manifold.boxminus(poses[judged], found.values[0][judged])
-    turn, shift = edge_parts(dim)
+    off = manifold.boxminus(found.values[0][judged], poses[judged])
+    turn, _ = edge_parts(dim)
     spare = dim * (len(part.edges) - len(part.ids) + len(np.unique(label)))
     scale = max(2.0 * found.cost / spare, 1.0) if spare >= _SPARE else 1.0
     squared = np.einsum("na,na->n", off, np.linalg.solve(P, off[:, :, None])[:, :, 0]) / scale
     squared[np.sqrt(np.einsum("nii->ni", P)[:, turn].max(axis=1)) > _LINEAR] = 0.0
-    is_off = squared > chi_square_exceeded(_STRANGE / len(judged), dim)
+    chance = 0.5 * _STRANGE  # for either way of asking
+    if reactions is not None:
+        alone = np.where(reactions.turn > _LINEAR, 0.0, reactions.squared) / scale
+        limits = np.array([math.inf, *(chi_square_exceeded(chance / len(alone), k) for k in range(1, dim + 1))])
+        is_off = alone > limits[reactions.directions]
+        if is_off.any():
+            return _sentence(graph, "the other fixed poses", reactions.rows, reactions.off, alone, is_off)
+    is_off = squared > chi_square_exceeded(chance / len(judged), dim)
     if not is_off.any():
         return None
+    anchor = anchors[label[anchors] == label[judged[int(np.argmax(squared))]]]
+    return _sentence(graph, f"pose {pose_names(graph, anchor)}", judged, off, squared, is_off)
+
+
+def _sentence(
+    graph: PoseGraph,
+    witness: str,
+    rows: NDArray[np.int64],
+    off: NDArray[np.float64],
+    squared: NDArray[np.float64],
+    is_off: NDArray[np.bool_],
+) -> str:
+    """What the edges say of the worst of the fixed poses `rows`, as the witness sees it."""
+    turn, shift = edge_parts(off.shape[1])
     worst = int(np.argmax(squared))
-    anchor = anchors[label[anchors] == label[judged[worst]]]
     distance, angle = np.linalg.norm(off[worst, shift]), math.degrees(float(np.linalg.norm(off[worst, turn])))
     more = np.count_nonzero(is_off) - 1
     return (
-        f"the edges contradict the poses that the file fixes: as seen from pose {pose_names(graph, anchor)} they put pose "
-        f"{graph.ids[judged[worst]]} {distance:.3g} m and {angle:.3g} deg from where it is fixed, by "
-        f"{math.sqrt(squared[worst]):.3g} standard deviations"
+        f"the edges contradict the poses that the file fixes: as seen from {witness} they put pose {graph.ids[rows[worst]]} "
+        f"{distance:.3g} m and {angle:.3g} deg from where it is fixed, by {math.sqrt(squared[worst]):.3g} standard deviations"
         + (f", and {more} more elsewhere" if more else "")
         + ": one of these is wrong, or of another world, or the information of the edges claims too much"
     )
