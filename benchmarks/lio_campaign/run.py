@@ -266,4 +266,14 @@ def _facts(outcome: Outcome) -> dict[str, Any]:
         "start": None if summary is None or summary.start is None else summary.start.kind,
         "extrinsic_source": None if summary is None else summary.extrinsic.source,
         "read_as": {entry["key"]: entry["value"] for entry in evidence if entry["key"].endswith("_unit")},
+        **_last_sigmas(outcome.estimate),
     }
+
+
+def _last_sigmas(estimate: Trajectory | None) -> dict[str, float]:
+    """How well a run claims to know its last pose, along the axis that it knows least: rotation [deg] and position [m]."""
+    if estimate is None or estimate.covariance is None:
+        return {}
+    P = estimate.covariance[-1]
+    turn, place = (np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0)) for block in (P[:3, :3], P[3:, 3:]))
+    return {"last_sigma_deg": round(float(np.rad2deg(turn)), 3), "last_sigma_m": round(float(place), 4)}

@@ -46,6 +46,7 @@ from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
 from boxplus.systems.lidar_inertial_odometry.watches.long_baseline import LongBaseline
 from boxplus.systems.lidar_inertial_odometry.watches.weak_spell import WeakSpell
+from boxplus.systems.lidar_inertial_odometry.well_placed import well_placed
 
 _LONGEST_START_SCANS, _FEWEST_NEW = 30, 0.3  # scans that a start may take, share of them that is new in every try
 _BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS = 3, 8, 2
@@ -261,7 +262,7 @@ class LidarInertialOdometry(Snapshots):
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
         if taken or len(self.map) == 0 or self._consistency.lost:
-            self._insert(map_points_world)
+            self._insert(well_placed(map_points_world, state, update.cov if taken else cov_prior))
         clock.lap("map insertion")
         status = self._weak_spell.status(frame.scan.end_ns, posterior.last.directions, taken)
         return self._estimate(frame, p_lidar, Outcome(measurement, posterior, taken, cov_prior, update.cov, status), clock.laps)
