@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 
 import numpy as np
+from numpy.typing import NDArray
 
 from boxplus._words import either
 from boxplus.filtering.nav_state import T_THETA_L
@@ -18,8 +20,9 @@ from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING
 
 _VAGUE_M, _VAGUE_SHARE = 0.05, 0.02  # of the way: a position less certain than both is of little use
 _UNKNOWN_M, _UNKNOWN_SHARE = 1.0, 0.2  # and one less certain than these is of none
+_VAGUE_DEG = 2.0  # of a rotation
 
-_PARTS = slice(0, 3), slice(3, 6)  # of the covariance of a mounting: rotation, translation
+_PARTS = slice(0, 3), slice(3, 6)  # of the covariance of a pose: rotation, position
 _LATE_S = 1.0  # a start in motion may take as long, and a second without a path is not missed
 
 
@@ -34,7 +37,7 @@ class RunStatistics(EstimateStatistics):
         self.rejected_points: Counter[str] = Counter()
         self.T_imu_lidar = np.eye(4)
         self._mounting_covariance = np.zeros((6, 6))
-        self._position_sigma_m = 0.0
+        self._position_sigma_m = self._rotation_sigma_deg = 0.0
         self._scan_gaps = GapWatch()
 
     def add_event(self, event: Scan | ImuSamples) -> None:
@@ -60,30 +63,38 @@ class RunStatistics(EstimateStatistics):
             self.warnings.add(text, estimate.time_ns)
         self.T_imu_lidar[:3, :3], self.T_imu_lidar[:3, 3] = estimate.state.R_imu_lidar, estimate.state.p_imu_lidar
         self._mounting_covariance = estimate.covariance[T_THETA_L:, T_THETA_L:]
-        self._position_sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(estimate.pose_covariance[3:, 3:])[-1], 0.0)))
+        turn, shift = _largest_sigmas(estimate.pose_covariance)
+        self._rotation_sigma_deg, self._position_sigma_m = float(np.degrees(turn)), shift
 
     @property
     def mounting_sigma(self) -> tuple[float, float]:
         """How uncertain the last T_imu_lidar is where that is most: rotation [deg] and translation [m]."""
-        turn, arm = (np.sqrt(max(np.linalg.eigvalsh(self._mounting_covariance[part, part])[-1], 0.0)) for part in _PARTS)
-        return float(np.degrees(turn)), float(arm)
+        turn, arm = _largest_sigmas(self._mounting_covariance)
+        return float(np.degrees(turn)), arm
 
     def vague_warnings(self, mounting_sigma: tuple[float, float] | None) -> list[WarningFacts]:
-        """A warning where the run ends at a position that it does not claim to know, with what may be behind it.
+        """A warning where the run ends at a pose that it does not claim to know, with what may be behind it.
 
         Args:
             mounting_sigma: how uncertain T_imu_lidar was at first, rotation [deg] and translation [m]; None where it is taken for
                 exact.
         """
-        text = self._told_of_position(_VAGUE_M, _VAGUE_SHARE, mounting_sigma)
+        text = self._told_of_pose(_VAGUE_M, _VAGUE_SHARE, _VAGUE_DEG, mounting_sigma)
         return [] if text is None else [WarningFacts(text=text, count=1)]
 
     def unknown_position(self, mounting_sigma: tuple[float, float] | None) -> str | None:
         """The same where the position is so little known that the run is not to be trusted."""
-        return self._told_of_position(_UNKNOWN_M, _UNKNOWN_SHARE, mounting_sigma)
+        return self._told_of_pose(_UNKNOWN_M, _UNKNOWN_SHARE, math.inf, mounting_sigma)
 
-    def _told_of_position(self, least_m: float, share: float, mounting_sigma: tuple[float, float] | None) -> str | None:
-        if self._position_sigma_m <= max(least_m, share * self.path_length_m):
+    def _told_of_pose(
+        self, least_m: float, share: float, least_deg: float, mounting_sigma: tuple[float, float] | None
+    ) -> str | None:
+        little = []
+        if self._position_sigma_m > max(least_m, share * self.path_length_m):
+            little.append(f"position to {_length(self._position_sigma_m)}")
+        if self._rotation_sigma_deg > least_deg:
+            little.append(f"rotation to {self._rotation_sigma_deg:.1f} deg")
+        if not little:
             return None
         open_scans, why = self.count - self.status["ok"], []
         if mounting_sigma is not None:
@@ -92,7 +103,7 @@ class RunStatistics(EstimateStatistics):
         if open_scans:
             why.append(f"{open_scans} of {self.count} scans left directions open")
         return (
-            f"by its own covariance the run knows its last position to {_length(self._position_sigma_m)} (1 sigma) only, after a "
+            f"by its own covariance the run knows its last {' and its last '.join(little)} (1 sigma) only, after a "
             f"way of {_length(self.path_length_m)}: {', and '.join(why) or 'its start, its IMU and what it saw tell no more'}"
         )
 
@@ -120,6 +131,12 @@ class RunStatistics(EstimateStatistics):
     def scan_gaps(self) -> list[Gap]:
         """Intervals between the ends of scans more than three times the usual one."""
         return self._scan_gaps.gaps(self.first_time_ns or 0) if self.first_time_ns is not None else []
+
+
+def _largest_sigmas(P: NDArray[np.float64]) -> tuple[float, float]:
+    """Standard deviations along the axes that a pose's covariance (6, 6) knows least: rotation [rad], position [m]."""
+    turn, shift = (float(np.sqrt(max(np.linalg.eigvalsh(P[part, part])[-1], 0.0))) for part in _PARTS)
+    return turn, shift
 
 
 def _length(metres: float) -> str:

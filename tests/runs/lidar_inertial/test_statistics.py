@@ -52,12 +52,18 @@ def estimate(scan: int, p: np.ndarray, P: np.ndarray, status: Status = "ok") -> 
     )
 
 
-def straight(way_m: float, sigma_m: float, axis: np.ndarray, statuses: tuple[Status, ...] = ("ok",) * 5) -> RunStatistics:
-    """A way of some length, its last position known to `sigma_m` along a direction (3,), a hundred times better across it."""
+def straight(
+    way_m: float, sigma_m: float, axis: np.ndarray, statuses: tuple[Status, ...] = ("ok",) * 5, *, sigma_deg: float = 0.0
+) -> RunStatistics:
+    """A way of some length, its last position known to `sigma_m` along a direction (3,), a hundred times better across it.
+
+    The rotation likewise, to `sigma_deg`.
+    """
     statistics = RunStatistics()
     turn = so3.exp(np.cross([0.0, 0.0, 1.0], axis / np.linalg.norm(axis)))
     P = np.zeros((6, 6))
-    P[3:, 3:] = turn @ np.diag(np.array([0.01, 0.01, 1.0]) * sigma_m) ** 2 @ turn.T
+    for part, sigma in ((slice(0, 3), np.deg2rad(sigma_deg)), (slice(3, 6), sigma_m)):
+        P[part, part] = turn @ np.diag(np.array([0.01, 0.01, 1.0]) * sigma) ** 2 @ turn.T
     for scan, status in enumerate(statuses):
         last = scan == len(statuses) - 1
         statistics.add(estimate(scan, np.array([way_m * scan / (len(statuses) - 1), 0.0, 0.0]), P if last else 100.0 * P, status))
@@ -79,6 +85,23 @@ def test_a_position_that_is_unknown_to_a_metre_and_to_a_fifth_of_the_way_is_told
     if not 0.999 < sigma_m / limit < 1.001:
         statistics = straight(way_m, sigma_m, axis)
         assert (statistics.unknown_position(None) is not None) == (sigma_m > limit)
+
+
+@given(st.floats(0.0, 90.0), st.integers(0, 1000))
+def test_a_warning_where_and_only_where_the_last_rotation_is_vague(sigma_deg: float, seed: int) -> None:
+    """A stairwell seen by sixteen rings: 2.5 deg off at 2.9 deg of its own (1 sigma), and nothing said."""
+    axis = np.random.default_rng(seed).normal(size=3)
+    statistics = straight(20.0, 0.01, axis, sigma_deg=sigma_deg)
+    assert statistics.unknown_position(None) is None
+    if abs(sigma_deg - 2.0) > 0.01:
+        told = [warning.text for warning in statistics.vague_warnings(None)]
+        assert len(told) == (sigma_deg > 2.0)
+        assert all(f"knows its last rotation to {sigma_deg:.1f} deg (1 sigma) only, after" in text for text in told)
+
+
+def test_position_and_rotation_are_told_in_one_sentence() -> None:
+    (warning,) = straight(8.0, 0.31, np.ones(3), sigma_deg=3.0).vague_warnings(None)
+    assert "knows its last position to 31 cm and its last rotation to 3.0 deg (1 sigma) only, after a way" in warning.text
 
 
 def test_what_may_be_behind_it_is_said() -> None:
