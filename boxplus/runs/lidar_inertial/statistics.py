@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 
 import numpy as np
@@ -79,20 +78,19 @@ class RunStatistics(EstimateStatistics):
             mounting_sigma: how uncertain T_imu_lidar was at first, rotation [deg] and translation [m]; None where it is taken for
                 exact.
         """
-        text = self._told_of_pose(_VAGUE_M, _VAGUE_SHARE, _VAGUE_DEG, mounting_sigma)
+        text = self._told_of_pose(mounting_sigma)
         return [] if text is None else [WarningFacts(text=text, count=1)]
 
     def unknown_position(self, mounting_sigma: tuple[float, float] | None) -> str | None:
         """The same where the position is so little known that the run is not to be trusted."""
-        return self._told_of_pose(_UNKNOWN_M, _UNKNOWN_SHARE, math.inf, mounting_sigma)
+        is_unknown = self._position_sigma_m > max(_UNKNOWN_M, _UNKNOWN_SHARE * self.path_length_m)
+        return self._told_of_pose(mounting_sigma) if is_unknown else None
 
-    def _told_of_pose(
-        self, least_m: float, share: float, least_deg: float, mounting_sigma: tuple[float, float] | None
-    ) -> str | None:
+    def _told_of_pose(self, mounting_sigma: tuple[float, float] | None) -> str | None:
         little = []
-        if self._position_sigma_m > max(least_m, share * self.path_length_m):
+        if self._position_sigma_m > max(_VAGUE_M, _VAGUE_SHARE * self.path_length_m):
             little.append(f"position to {_length(self._position_sigma_m)}")
-        if self._rotation_sigma_deg > least_deg:
+        if self._rotation_sigma_deg > _VAGUE_DEG:
             little.append(f"rotation to {self._rotation_sigma_deg:.1f} deg")
         if not little:
             return None

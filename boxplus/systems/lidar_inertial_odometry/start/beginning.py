@@ -22,7 +22,7 @@ _QUIET_GYRO, _QUIET_ACCEL = 0.1, 0.5  # rad/s, m/s²: standard deviations at res
 _FEWEST_QUIET_SAMPLES, _QUIET_TURN = 11, 0.03  # rad/s on average, an axis: the bias of a gyroscope in order
 _PARTS, _STEADY_ACCEL = 5, 0.1  # m/s²: what means over a fifth of a second may differ by, besides what vibration leaves
 _PATIENCE_S, _PATIENT_SCANS = 3.0, 30
-_UPRIGHT = 0.9  # cosine of an axis and the vertical
+_UPRIGHT = 0.98  # cosine of an axis and the vertical: 0.999 and more of those along which walls leave it open
 WAITING = "; waiting for more data"
 """How a refusal ends that the next scans may lift."""
 
