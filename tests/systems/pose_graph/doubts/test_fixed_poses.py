@@ -58,6 +58,14 @@ def test_a_fixed_pose_that_its_neighbours_contradict_is_told_however_far_the_fir
         assert ("as seen from the other fixed poses they put pose 150" in doubt) == is_told
 
 
+@pytest.mark.parametrize("seed", [1136, 1141, 1241])
+def test_where_rotations_bend_a_lot_a_fixed_pose_is_asked_about_by_a_solve(seed):
+    """To first order the edges put one of these 87 to 110 deg off, by more than 6 standard deviations: it is 17 to 60 deg."""
+    simulated = simulate_pose_graph(dimension=3, poses=150, loops=10, seed=seed, sigma_rotation=0.2)
+    graph = replace(simulated.graph, poses=simulated.truth, fixed=np.arange(0, 150, 5))
+    assert optimize_pose_graph(graph, PoseGraphConfig(start="file")).doubt is None
+
+
 def test_information_that_is_too_large_contradicts_no_fixed_pose():
     graph = _fixed(2)
     result = optimize_pose_graph(replace(graph, information=9.0 * graph.information))
