@@ -262,7 +262,8 @@ class LidarInertialOdometry(Snapshots):
         clock.lap("update")
         # Where the map has been left for good, a new one begins at the predicted pose.
         if taken or len(self.map) == 0 or self._consistency.lost:
-            self._insert(well_placed(map_points_world, state, update.cov if taken else cov_prior))
+            p_began = self.start.state.p_world_imu if self.start is not None else state.p_world_imu
+            self._insert(well_placed(map_points_world, state, update.cov if taken else cov_prior, p_began))
         clock.lap("map insertion")
         status = self._weak_spell.status(frame.scan.end_ns, posterior.last.directions, taken)
         return self._estimate(frame, p_lidar, Outcome(measurement, posterior, taken, cov_prior, update.cov, status), clock.laps)
@@ -337,9 +338,8 @@ class LidarInertialOdometry(Snapshots):
 
     def _thinned(self, p_lidar: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Centroids and representatives of a scan; the map's cells become those that suit it."""
-        voxel = self._voxel_filter.voxel_size
         points, map_points = self._voxel_filter(p_lidar)
-        self.map.cell_size = map_cell_for(points, voxel, self.config)
+        self.map.cell_size = map_cell_for(points, self._voxel_filter.voxel_size, self.config)
         return points, map_points
 
     def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:

@@ -1,10 +1,13 @@
-"""Which points of a scan go into the map: those that lie where they seem to.
+"""Which points of a scan go into the map while the platform is where it began: those that lie where they seem to.
 
 A rotation that is known to σ places a point at the range r to r σ. Where the surroundings leave the rotation open, as a field
 does to a sensor at rest, a quarter of a degree is 20 cm at 45 m, and the same for all points of a scan: rings of neighbouring
 scans come to lie beside each other at heights that differ by that, and planes through both stand steeply on level ground. They
-are false, look certain, and turn the platform as soon as it moves. Points near enough go in all the same, and the others once a
-scan has told the rotation.
+are false, look certain, and turn the platform as soon as it moves.
+
+Near where it began nothing is lost without such points: the first scans hold what is to be seen from there. Elsewhere all points
+go in. On the way the rotation against the first pose is ever less known, about the vertical above all, while that against the
+last scans is; a map that took nothing in for it would run dry, and what could tell the rotation would never come into it.
 
 Derivation: docs/lidar_inertial_odometry.md, section 9.
 """
@@ -16,11 +19,14 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.nav_state import NavState
 
+NEAR_M = 3.0  # of where the odometry began
 LARGEST_SIGMA_M = 0.1  # what the tilt of a plane is taken to be worth of a map point (`filtering.plane_information`)
 
 
-def well_placed(p_world: NDArray[np.float64], state: NavState, cov: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (m, 3) whose place the uncertainty of the rotation moves by no more than `LARGEST_SIGMA_M`.
+def well_placed(
+    p_world: NDArray[np.float64], state: NavState, cov: NDArray[np.float64], p_began: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points (m, 3) whose place the uncertainty of the rotation moves by no more than `LARGEST_SIGMA_M`; `NEAR_M` away, all.
 
     That of the position moves all points of a scan alike, and bends none of its planes.
 
@@ -28,6 +34,7 @@ def well_placed(p_world: NDArray[np.float64], state: NavState, cov: NDArray[np.f
         p_world: (n, 3) points at the estimated pose, world frame [m].
         state: by which they came there.
         cov: (24, 24) its covariance, with the mounting known: one that is not moves the IMU, and not what the LiDAR sees.
+        p_began: (3,) where the odometry began [m].
 
     Returns:
         The same array where all of them are, as in nearly every scan.
@@ -36,9 +43,11 @@ def well_placed(p_world: NDArray[np.float64], state: NavState, cov: NDArray[np.f
         >>> p_world = np.array([[10.0, 0.0, 0.0], [60.0, 0.0, 0.0]])
         >>> state, cov = NavState.identity(), np.zeros((24, 24))
         >>> cov[:3, :3] = np.deg2rad(0.2) ** 2 * np.eye(3)
-        >>> well_placed(p_world, state, cov)
+        >>> well_placed(p_world, state, cov, np.zeros(3))
         array([[10.,  0.,  0.]])
     """
+    if float(np.linalg.norm(state.p_world_imu - p_began)) > NEAR_M:
+        return p_world
     turn = state.R_world_imu @ cov[:3, :3] @ state.R_world_imu.T
     r = p_world - state.p_world_imu
     squared = np.einsum("ni,ni->n", r, r)

@@ -76,9 +76,12 @@ def fixed_poses_doubt(
         if found.is_broken_off or found.unconverged() is not None:
             return None
         P = found.covariance(variables[judged])
-        reactions = Reactions.of(part, options, loss, watch)
     except BoxplusError:  # pieces of the graph that only the fixed poses held
         return None
+    try:
+        reactions = Reactions.of(part, options, loss, watch)
+    except BoxplusError:
+        reactions = None
     off = manifold.boxminus(found.values[0][judged], poses[judged])
     turn, _ = edge_parts(dim)
     spare = dim * (len(part.edges) - len(part.ids) + len(np.unique(label)))
