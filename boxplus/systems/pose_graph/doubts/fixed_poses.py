@@ -122,7 +122,7 @@ def _let_go(
     deviations of 17 deg and 3.3.
     """
     manifold = SE3 if graph.dimension == 3 else SE2
-    problem, variables = pose_graph_problem(replace(graph, fixed=np.setdiff1d(graph.fixed, [row])), loss=loss)
+    problem, variables = pose_graph_problem(graph, held=np.setdiff1d(graph.fixed, [row]), loss=loss)
     try:
         found = problem.solve(options, start=[poses], callback=callback)
         if found.is_broken_off or found.unconverged() is not None:

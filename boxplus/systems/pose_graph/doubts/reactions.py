@@ -19,10 +19,9 @@ from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimizers.minimize import Callback
-from boxplus.optimization.problem import Problem
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.residuals.prior import Prior
-from boxplus.systems.pose_graph.problem import edge_parts, residual_of
+from boxplus.systems.pose_graph.problem import edge_parts, pose_graph_problem, residual_of
 from boxplus.systems.pose_graph.start import components
 
 _STIFF = 30.0  # times all that the edges of a pose say of it
@@ -65,13 +64,9 @@ class Reactions:
             return None
         manifold = SE3 if graph.dimension == 3 else SE2
         W = _STIFF * _stiffness(graph, graph.poses)[rows]
-        problem = Problem()
-        poses = problem.add_variables(manifold, graph.poses, name="poses")
-        i, j = graph.edges.T
-        problem.add_residuals(residual_of(graph), poses[i], poses[j], loss=loss, name="edges")
+        problem, poses = pose_graph_problem(graph, held=np.setdiff1d(graph.fixed, rows), loss=loss)
         springs = W[:, :, None] * np.eye(W.shape[1])
         problem.add_residuals(Prior(manifold, graph.poses[rows], information=springs), poses[rows], name="fixed poses")
-        problem.fix(poses[np.setdiff1d(graph.fixed, rows)])
         found = problem.solve(options, start=[graph.poses], callback=callback)
         if found.is_broken_off or found.unconverged() is not None:
             return None
