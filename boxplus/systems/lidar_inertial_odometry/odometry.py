@@ -338,8 +338,8 @@ class LidarInertialOdometry(Snapshots):
 
     def _thinned(self, p_lidar: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Centroids and representatives of a scan; the map's cells become those that suit it."""
-        points, map_points = self._voxel_filter(p_lidar)
-        self.map.cell_size = map_cell_for(points, self._voxel_filter.voxel_size, self.config)
+        voxel, (points, map_points) = self._voxel_filter.voxel_size, self._voxel_filter(p_lidar)  # in this order: it adapts
+        self.map.cell_size = map_cell_for(points, voxel, self.config)
         return points, map_points
 
     def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:
