@@ -10,6 +10,7 @@ from draw_filter import Filtered
 from imu_grades import IMU_GRADES, draw_imu
 from numpy.typing import NDArray
 
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Fault, RosetteLidar, Scenario, Simulation, SpinningLidar, faults, mounting
 from boxplus.simulation.lidar import LidarModel
 from boxplus.simulation.motions import manoeuvres
@@ -79,7 +80,20 @@ class Draw:
 
     def truth(self) -> Simulation:
         """The recording before anything is spoilt, and its exact motion."""
-        return Simulation(self.scenario, self.seed, self.duration_s)
+        return _CastOnce(self.scenario, self.seed, self.duration_s)
+
+
+class _CastOnce(Simulation):
+    """A simulation that keeps its scans: an odometry reads the beginning of a recording several times."""
+
+    def __init__(self, scenario: Scenario, seed: int, duration_s: float) -> None:
+        super().__init__(scenario, seed, duration_s)
+        self._scans: dict[int, Scan] = {}
+
+    def scan(self, index: int) -> Scan:
+        if index not in self._scans:
+            self._scans[index] = super().scan(index)
+        return self._scans[index]
 
 
 def draw_kinds(seed: int, *, fast: bool = False) -> Kinds:

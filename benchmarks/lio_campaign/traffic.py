@@ -68,6 +68,7 @@ def _entered(
     """How far along rays (N, 3) a box (3,), (3,) is entered (N,), inf where it is not: by the three pairs of its sides."""
     with np.errstate(divide="ignore", invalid="ignore"):
         first, second = (low - origin) / direction, (high - origin) / direction
-    enter = np.nanmax(np.minimum(first, second), axis=1)
-    leave = np.nanmin(np.maximum(first, second), axis=1)
+    # Along the sides of a box that they touch rays have no number: the other two pairs tell.
+    enter = np.fmax.reduce(np.minimum(first, second), axis=1)
+    leave = np.fmin.reduce(np.maximum(first, second), axis=1)
     return np.where((enter < leave) & (enter > 0.0), enter, np.inf)

@@ -48,6 +48,7 @@ def match_planes(
     plane_threshold: float,
     warm: bool,
     neighbours: NDArray[np.float32],
+    reach: NDArray[np.float32],
     planes: NDArray[np.float64],
     fate: NDArray[np.uint8],
     found_sq: NDArray[np.float32],
@@ -61,8 +62,9 @@ def match_planes(
         p_lidar: (n, 3) deskewed points, LiDAR frame.
         max_distance_sq: squared distance the fifth neighbour may have [m²].
         plane_threshold: largest distance of a neighbour from the plane [m].
-        warm: `neighbours` holds the result of an earlier call on the same map: their distances bound the search.
+        warm: `neighbours` and `reach` hold the result of an earlier call on the same map: their distances bound the search.
         neighbours: (n, 5, 3), relative to `origin`.
+        reach: (n, 4) receives where a point was that has needed fifteen, and how far the last of them; 0 where five were enough.
         planes: (n, PLANE) receives the planes.
         fate: (n,) receives USED, FEW_NEIGHBOURS, NOT_A_PLANE or ONE_LINE.
         found_sq: (NEIGHBOURS,), stack: (STACK_DEPTH + MANY,), scratch of the calling thread.
@@ -79,17 +81,30 @@ def match_planes(
         yy = x[R + 3] * sx + x[R + 4] * sy + x[R + 5] * sz + x[P + 1] - origin[1]
         yz = x[R + 6] * sx + x[R + 7] * sy + x[R + 8] * sz + x[P + 2] - origin[2]
         near = neighbours[n]
-        # Five points of the map bound the search: those of an earlier call, or those of the point before, which is near by.
-        known = n if warm else n - 1
         qx, qy, qz = np.float32(yx), np.float32(yy), np.float32(yz)  # far from the origin, rounding exceeds the slack
-        bound = max_distance_sq
-        if (warm or n > begin) and fate[known] != FEW_NEIGHBOURS:
-            farthest = 0.0
-            for i in range(NEIGHBOURS):
-                dx, dy, dz = neighbours[known, i, 0] - qx, neighbours[known, i, 1] - qy, neighbours[known, i, 2] - qz
-                farthest = max(farthest, np.float64(dx * dx + dy * dy + dz * dz))
-            bound = min(bound, farthest * _SLACK)
-        count = knn5(view, qx, qy, qz, np.float32(bound), near, found_sq, stack)
+        seen = reach[n]
+        asked = warm and seen[3] > 0.0  # on a line before, it will be on one again: one search for fifteen finds five as well
+        found = np.int64(0)
+        if asked:
+            moved = math.sqrt((seen[0] - qx) ** 2 + (seen[1] - qy) ** 2 + (seen[2] - qz) ** 2)
+            bound = min(max_distance_sq, (np.float64(seen[3]) + moved) ** 2 * _SLACK)
+            found = knn(view, qx, qy, qz, np.float32(bound), many_sq, stack)
+            copy_found(view, stack, MANY, found, many)
+            count = min(found, NEIGHBOURS)
+            for i in range(count):
+                near[i] = many[i]
+        else:
+            # Five points of the map bound the search: those of an earlier call, or those of the point before, which is near by.
+            known = n if warm else n - 1
+            bound = max_distance_sq
+            if (warm or n > begin) and fate[known] != FEW_NEIGHBOURS:
+                farthest = 0.0
+                for i in range(NEIGHBOURS):
+                    dx, dy, dz = neighbours[known, i, 0] - qx, neighbours[known, i, 1] - qy, neighbours[known, i, 2] - qz
+                    farthest = max(farthest, np.float64(dx * dx + dy * dy + dz * dz))
+                bound = min(bound, farthest * _SLACK)
+            count = knn5(view, qx, qy, qz, np.float32(bound), near, found_sq, stack)
+        seen[3] = 0.0
         if count < NEIGHBOURS:
             fate[n] = FEW_NEIGHBOURS
             continue
@@ -102,9 +117,11 @@ def match_planes(
         on_line = _lies_on_line(fit, NEIGHBOURS, rx, ry, rz)
         fitted = near
         if on_line:
-            found = knn(view, qx, qy, qz, np.float32(max_distance_sq), many_sq, stack)
+            if not asked:
+                found = knn(view, qx, qy, qz, np.float32(max_distance_sq), many_sq, stack)
+                copy_found(view, stack, MANY, found, many)
             if found == MANY:
-                copy_found(view, stack, MANY, MANY, many)
+                seen[0], seen[1], seen[2], seen[3] = qx, qy, qz, np.float32(math.sqrt(many_sq[MANY - 1]))
                 on_line = not fit_plane_into(many, MANY, plane_threshold, fit) or _lies_on_line(fit, MANY, rx, ry, rz)
                 fitted = many
         if on_line:

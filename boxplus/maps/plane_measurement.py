@@ -80,6 +80,7 @@ class PlaneMeasurement:
         self._weight = weight
         self._confirm = confirm
         self._neighbours = np.zeros((n, NEIGHBOURS, 3), dtype=np.float32)
+        self._reach = np.zeros((n, 4), dtype=np.float32)
         self._planes = np.zeros((n, PLANE))
         self._fate = np.zeros(n, dtype=np.uint8)
         self._matched = False
@@ -226,6 +227,7 @@ class PlaneMeasurement:
                 config.plane_threshold,
                 warm,
                 self._neighbours,
+                self._reach,
                 self._planes,
                 self._fate,
                 np.zeros(NEIGHBOURS, dtype=np.float32),

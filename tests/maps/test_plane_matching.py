@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,12 +25,14 @@ seeds = st.integers(0, 2**32 - 1)
 @dataclass
 class Match:
     neighbours: np.ndarray
+    reach: np.ndarray
     planes: np.ndarray
     fate: np.ndarray
 
 
 def _new(count: int) -> Match:
-    return Match(np.zeros((count, NEIGHBOURS, 3), np.float32), np.zeros((count, PLANE)), np.zeros(count, np.uint8))
+    neighbours, reach = np.zeros((count, NEIGHBOURS, 3), np.float32), np.zeros((count, 4), np.float32)
+    return Match(neighbours, reach, np.zeros((count, PLANE)), np.zeros(count, np.uint8))
 
 
 def _match(tree: IkdTree, x: NavState, points: np.ndarray, into: Match | None = None) -> Match:
@@ -45,6 +48,7 @@ def _match(tree: IkdTree, x: NavState, points: np.ndarray, into: Match | None = 
         THRESHOLD,
         into is not None,
         match.neighbours,
+        match.reach,
         match.planes,
         match.fate,
         np.zeros(NEIGHBOURS, np.float32),
@@ -162,14 +166,18 @@ def test_a_ring_around_a_corner_is_not_taken_for_a_floor() -> None:
     assert (np.abs(match.planes[used, 2]) < 0.3).all()
 
 
-def test_where_five_points_lie_on_a_line_fifteen_show_the_next_one() -> None:
-    """A wall 18 m ahead in rings 0.4 m apart, each a dense line."""
+def _rings(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A wall 18 m ahead in rings 0.4 m apart, each a dense line, and the points of the middle one."""
     across = np.arange(-3.0, 3.0, 0.1)
     wall = np.concatenate(
         [np.stack([np.full_like(across, 18.0), across, np.full_like(across, z)], axis=1) for z in (-0.4, 0.0, 0.4)]
     )
-    wall += np.random.default_rng(1).normal(size=wall.shape) * (0.01, 0.0, 0.05)
-    points = wall[60:120].astype(np.float32)
+    wall += np.random.default_rng(seed).normal(size=wall.shape) * (0.01, 0.0, 0.05)
+    return wall, wall[60:120].astype(np.float32)
+
+
+def test_where_five_points_lie_on_a_line_fifteen_show_the_next_one() -> None:
+    wall, points = _rings(seed=1)
     match = _match(IkdTree(wall), NavState.identity(), points)
     used = match.fate == USED
     assert used.mean() > 0.8
@@ -198,9 +206,12 @@ def test_the_variance_of_a_normal_is_drawn_to_that_of_all(seed: int) -> None:
 
 
 @settings(max_examples=15)
-@given(seeds, st.sampled_from([0.0, 0.01, 0.3]))
-def test_a_warm_search_finds_what_a_cold_one_finds(seed: int, moved: float) -> None:
+@given(seeds, st.sampled_from([0.0, 0.01, 0.3]), st.booleans())
+def test_a_warm_search_finds_what_a_cold_one_finds(seed: int, moved: float, of_rings: bool) -> None:
     tree, _, x, points = _corner(seed)
+    if of_rings:
+        wall, points = _rings(seed)
+        tree, x = IkdTree(wall), NavState.identity()
     match = _match(tree, x, points)
     shift = np.zeros(24)
     shift[:6] = moved * np.random.default_rng(seed + 1).normal(size=6)
@@ -211,6 +222,8 @@ def test_a_warm_search_finds_what_a_cold_one_finds(seed: int, moved: float) -> N
     assert np.array_equal(warm.neighbours[matched], cold.neighbours[matched])
     used = cold.fate == USED
     assert np.array_equal(warm.planes[used], cold.planes[used])
+    assert (cold.reach[:, 3] > 0.0).any() or not of_rings or moved == 0.3
+    np.testing.assert_array_equal(warm.reach[:, 3], cold.reach[:, 3])
 
 
 def test_an_empty_map_has_no_planes() -> None:
@@ -228,7 +241,7 @@ def test_no_neighbour_is_lost_far_from_the_origin_of_the_map(seed: int) -> None:
     x = NavState(x.R_world_imu, x.p_world_imu + far, *(np.zeros(3),) * 4, x.R_imu_lidar, x.p_imu_lidar)
     first = _match(tree, x, points)
     found = first.fate != FEW_NEIGHBOURS
-    again = _match(tree, x, points, Match(first.neighbours.copy(), first.planes.copy(), first.fate.copy()))
+    again = _match(tree, x, points, copy.deepcopy(first))
     np.testing.assert_array_equal(again.fate, first.fate)
     np.testing.assert_array_equal(again.neighbours[found], first.neighbours[found])
     alone = np.concatenate([_match(tree, x, point[None]).fate for point in points])  # no point before bounds the search
