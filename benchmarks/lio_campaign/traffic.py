@@ -55,11 +55,23 @@ def traffic(scene: Scene, seed: int) -> Fault:
             # In the own lane a vehicle keeps its distance, whatever the platform does.
             away = origin - begin[k]
             away[:, 0] -= own_x if lane[k] == 0 else forwards * speed[k] * seconds
-            hit = _entered(away, direction, low[k], high[k])
-            seen = np.where((hit > 0.5) & (hit < seen), hit, seen)
+            facing = _facing(away, direction, low[k], high[k])
+            hit = _entered(away[facing], direction[facing], low[k], high[k])
+            seen[facing] = np.where((hit > 0.5) & (hit < seen[facing]), hit, seen[facing])
         return moved(scan, scan.p_lidar * (seen / ranges)[:, None])
 
     return changes("traffic", f"{count} vehicles at {fleet:.0f} m/s, platform at {own:.0f}", scan)
+
+
+def _facing(
+    origin: NDArray[np.float64], direction: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Which of the rays (N, 3) may enter a box, by the ball about it and about all of their origins."""
+    middle = origin.mean(axis=0)
+    to_box = 0.5 * (low + high) - middle
+    reach = 0.5 * float(np.linalg.norm(high - low)) + float(np.linalg.norm(origin - middle, axis=1).max())
+    beside_sq = float(to_box @ to_box) - reach**2
+    return np.flatnonzero(direction @ to_box > np.sqrt(beside_sq)) if beside_sq > 0.0 else np.arange(len(direction))
 
 
 def _entered(

@@ -41,8 +41,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import (
 MOST_POINTS = 1500  # that a scan is registered with
 MOST_MAP_POINTS = 5000  # that it leaves in the map
 MOST_RAW = 12_000  # that it is undistorted and filtered from
-_PASSES = 3  # the motion found may put other points into a voxel than the one expected did
-_STEPS = 24  # of a registration that undistorts after each of them
+_STEPS = 16, 12, 8  # of a registration, and of further ones: the motion found may put other points into a voxel
 # The steps of a path have a floor of noise: a direction may count that says hardly more than noise.
 _WEAK = 0.7
 _INDEPENDENT_M = 0.5  # between points whose errors are independent
@@ -190,21 +189,21 @@ class LidarMotion:
             best = self._again(first, scan, middle_ns, step_s, best, expected)
         if expected is not None or self._failed > _MOST_SEARCHES or (best is not None and best.misfit < GOOD_MISFIT_M):
             return best
-        kept = self._tree, self._rate, self._velocity
-        rate, found = self._turning(middle_ns, step_s)[0], list[_Fit]()
+        kept, rate, found = self._tree, self._turning(middle_ns, step_s)[0], list[_Fit]()
         for velocity in (speed * axis for speed in _FIRST_SPEEDS for axis in np.vstack([np.eye(3), -np.eye(3)])):
             self._tree = self._map_of(first, rate, velocity)
             found += filter(None, [self._register(scan, middle_ns, step_s, rate, velocity)])
         # Before the map is made for it the right speed fits hardly better than others.
-        tried = [kept[2] if best is None else best.velocity]
-        for candidate in sorted(found, key=lambda fit: fit.cost):
-            if len(tried) > _MOST_TRIED or min(np.linalg.norm(candidate.velocity - other) for other in tried) < _ANOTHER_M_S:
+        tried = [self._velocity if best is None else best.velocity]
+        for other in sorted(found, key=lambda fit: fit.cost):
+            if len(tried) > _MOST_TRIED or min(np.linalg.norm(other.velocity - velocity) for velocity in tried) < _ANOTHER_M_S:
                 continue
-            tried.append(candidate.velocity)
-            again = self._again(first, scan, middle_ns, step_s, candidate, expected)
+            tried.append(other.velocity)
+            self._tree = self._map_of(first, other.rate, other.velocity)
+            again = self._register(scan, middle_ns, step_s, other.rate, other.velocity)
             if again is not None and (best is None or again.cost < best.cost):
-                best, kept = again, (self._tree, self._rate, self._velocity)
-        self._tree, self._rate, self._velocity = kept
+                best, kept = again, self._tree
+        self._tree = kept
         return best
 
     def _again(self, first: Scan, scan: Scan, middle_ns: int, step_s: float, fit: _Fit, expected: Twist | None) -> _Fit | None:
@@ -318,7 +317,7 @@ class LidarMotion:
         def follow() -> None:
             points[:] = self._filter.means(seen())
 
-        for number in range(_PASSES):
+        for number, steps in enumerate(_STEPS):
             rate, velocity = motion()
             points = self._filter(seen())[0]
             if number == 0 and reached is not None:
@@ -329,7 +328,7 @@ class LidarMotion:
                     reached.append(x.copy())
                     continue
             measurement = self._measurement(points)
-            directions = align(x, measurement, self._config, held=held, steps=_STEPS, follow=follow)
+            directions = align(x, measurement, self._config, held=held, steps=steps, follow=follow)
             if directions is None:
                 return None
             turned, shifted = (
