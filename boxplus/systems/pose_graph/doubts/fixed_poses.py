@@ -11,7 +11,7 @@ non-convexity refuses the loop closures that contradict it.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from boxplus._chi_square import chi_square_exceeded
 from boxplus.errors import BoxplusError
 from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Loss
@@ -31,7 +32,7 @@ from boxplus.systems.pose_graph.named import named
 from boxplus.systems.pose_graph.problem import edge_parts, pose_graph_problem, with_edges
 from boxplus.systems.pose_graph.start import components, spanning_tree_start
 
-_STRANGE = 1e-4  # chance that the worst of the fixed poses of a sound graph is told
+_CHANCE = 5e-5  # that the worst of the fixed poses of a sound graph is told, by either way of asking
 _LINEAR = 0.3  # [rad] standard deviation of a rotation, up to which the covariance of poses that hang on it is right
 _ASKED = 3  # of the worst, whether they are off once more, by a solve each
 _SPARE = 10  # degrees of freedom from which on errors say how large noise is
@@ -57,19 +58,77 @@ def fixed_poses_doubt(
         callback: may stop the search, which then finds nothing.
     """
     watch = named(callback, "do the edges agree with fixed poses?")
+    part = with_edges(replace(graph, poses=poses), _believed(graph, poses, kept, is_loop, options, watch))
+    together = _all_let_go(part, poses, options, loss, watch)
+    if together is None:
+        return None
+    found = _each_let_go(part, poses, together.scale, options, loss, watch) or together
+    return found.sentence(graph) if found.is_off.any() else None
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """Where the edges put fixed poses that were let go.
+
+    Attributes:
+        witness: who holds them.
+        worst: which of them is told.
+        rows: (n,) of the graph.
+        off: (n, d) from where the file has them.
+        squared: (n,) that in standard deviations, squared.
+        is_off: (n,) whether chance does not explain it.
+        scale: of the variances, where the edges fit one another worse than they claim.
+    """
+
+    witness: str
+    worst: int
+    rows: NDArray[np.int64]
+    off: NDArray[np.float64]
+    squared: NDArray[np.float64]
+    is_off: NDArray[np.bool_]
+    scale: float
+
+    def sentence(self, graph: PoseGraph) -> str:
+        """What the edges say of the worst."""
+        worst, (turn, shift) = self.worst, edge_parts(self.off.shape[1])
+        distance, angle = np.linalg.norm(self.off[worst, shift]), math.degrees(float(np.linalg.norm(self.off[worst, turn])))
+        more = np.count_nonzero(self.is_off) - 1
+        return (
+            f"the edges contradict the poses that the file fixes: as seen from {self.witness} they put pose "
+            f"{graph.ids[self.rows[worst]]} {distance:.3g} m and {angle:.3g} deg from where it is fixed, by "
+            f"{math.sqrt(self.squared[worst]):.3g} standard deviations"
+            + (f", and {more} more elsewhere" if more else "")
+            + ": one of these is wrong, or of another world, or the information of the edges claims too much"
+        )
+
+
+def _believed(
+    graph: PoseGraph,
+    poses: NDArray[np.float64],
+    kept: NDArray[np.bool_],
+    is_loop: NDArray[np.bool_] | None,
+    options: SolverOptions,
+    watch: Callback | None,
+) -> NDArray[np.bool_]:
+    """(m,) edges to be asked: those kept, or, where some were refused, those that are kept without the poses to be let go."""
     anchors = _anchors(graph)
-    if is_loop is not None and not kept.all() and len(anchors) < len(graph.fixed):
-        loose = replace(graph, fixed=anchors)
-        odometry = with_edges(loose, ~is_loop)
-        is_whole = np.array_equal(components(odometry), components(graph))
-        start = spanning_tree_start(odometry) if is_whole else poses
-        kept = judge_loops(loose, is_loop, start, options, watch).is_kept
-    part = with_edges(replace(graph, poses=poses), kept)
+    if is_loop is None or kept.all() or len(anchors) == len(graph.fixed):
+        return kept
+    loose = replace(graph, fixed=anchors)
+    odometry = with_edges(loose, ~is_loop)
+    is_whole = np.array_equal(components(odometry), components(graph))
+    start = spanning_tree_start(odometry) if is_whole else poses
+    return judge_loops(loose, is_loop, start, options, watch).is_kept
+
+
+def _all_let_go(
+    part: PoseGraph, poses: NDArray[np.float64], options: SolverOptions, loss: Loss | None, watch: Callback | None
+) -> _Answer | None:
+    """All fixed poses let go but one of every piece; None where there is none, or no solution."""
     anchors, label = _anchors(part), components(part)
-    judged = np.setdiff1d(graph.fixed, anchors)
+    judged = np.setdiff1d(part.fixed, anchors)
     if not len(judged):
         return None
-    manifold, dim = (SE3 if graph.dimension == 3 else SE2), graph.information.shape[1]
     problem, variables = pose_graph_problem(replace(part, fixed=anchors), loss=loss)
     try:
         found = problem.solve(options, start=[poses], callback=watch)
@@ -78,34 +137,44 @@ def fixed_poses_doubt(
         P = found.covariance(variables[judged])
     except BoxplusError:  # pieces of the graph that only the fixed poses held
         return None
-    try:
-        reactions = Reactions.of(part, options, loss, watch)
-    except BoxplusError:
-        reactions = None
-    off = manifold.boxminus(found.values[0][judged], poses[judged])
+    off = _manifold(part).boxminus(found.values[0][judged], poses[judged])
+    dim = off.shape[1]
     turn, _ = edge_parts(dim)
     spare = dim * (len(part.edges) - len(part.ids) + len(np.unique(label)))
     scale = max(2.0 * found.cost / spare, 1.0) if spare >= _SPARE else 1.0
     squared = np.einsum("na,na->n", off, np.linalg.solve(P, off[:, :, None])[:, :, 0]) / scale
     squared[np.sqrt(np.einsum("nii->ni", P)[:, turn].max(axis=1)) > _LINEAR] = 0.0
-    chance = 0.5 * _STRANGE  # for either way of asking
-    if reactions is not None:
-        alone = np.where(reactions.turn > _LINEAR, 0.0, reactions.squared) / scale
-        limits = np.array([math.inf, *(chi_square_exceeded(chance / len(alone), k) for k in range(1, dim + 1))])
-        is_off = alone > limits[reactions.directions]
-        off_alone = reactions.off.copy()
-        for worst in np.argsort(-np.where(is_off, alone, -1.0))[: min(_ASKED, np.count_nonzero(is_off))]:
-            exact = _let_go(part, poses, int(reactions.rows[worst]), options, loss, watch)
-            if exact is not None:
-                off_alone[worst], alone[worst] = exact[0], exact[1] / scale
-            if alone[worst] > limits[reactions.directions[worst]]:
-                is_off = alone > limits[reactions.directions]
-                return _sentence(graph, "the other fixed poses", int(worst), reactions.rows, off_alone, alone, is_off)
-    is_off = squared > chi_square_exceeded(chance / len(judged), dim)
-    if not is_off.any():
+    worst = int(np.argmax(squared))
+    anchor = anchors[label[anchors] == label[judged[worst]]]
+    is_off = squared > chi_square_exceeded(_CHANCE / len(judged), dim)
+    return _Answer(f"pose {pose_names(part, anchor)}", worst, judged, off, squared, is_off, scale)
+
+
+def _each_let_go(
+    part: PoseGraph, poses: NDArray[np.float64], scale: float, options: SolverOptions, loss: Loss | None, watch: Callback | None
+) -> _Answer | None:
+    """Each fixed pose let go while all others hold; None where that finds none off, or tells nothing.
+
+    The worst that it finds is asked once more by a solve, which linear reactions are not.
+    """
+    try:
+        reactions = Reactions.of(part, options, loss, watch)
+    except BoxplusError:
         return None
-    anchor = anchors[label[anchors] == label[judged[int(np.argmax(squared))]]]
-    return _sentence(graph, f"pose {pose_names(graph, anchor)}", int(np.argmax(squared)), judged, off, squared, is_off)
+    if reactions is None:
+        return None
+    squared = np.where(reactions.turn > _LINEAR, 0.0, reactions.squared) / scale
+    off = reactions.off.copy()
+    limits = np.array([math.inf, *(chi_square_exceeded(_CHANCE / len(squared), k) for k in range(1, off.shape[1] + 1))])
+    limit = limits[reactions.directions]
+    is_off = squared > limit
+    for worst in np.argsort(-np.where(is_off, squared, -1.0))[: min(_ASKED, np.count_nonzero(is_off))]:
+        exact = _let_go(part, poses, int(reactions.rows[worst]), options, loss, watch)
+        if exact is not None:
+            off[worst], squared[worst] = exact[0], exact[1] / scale
+        if squared[worst] > limit[worst]:
+            return _Answer("the other fixed poses", int(worst), reactions.rows, off, squared, squared > limit, scale)
+    return None
 
 
 def _let_go(
@@ -121,7 +190,6 @@ def _let_go(
     None where none is to be had. What `Reactions` says is linear: of rotations known to 0.2 rad it made 110 deg and 6.4 standard
     deviations of 17 deg and 3.3.
     """
-    manifold = SE3 if graph.dimension == 3 else SE2
     problem, variables = pose_graph_problem(graph, held=np.setdiff1d(graph.fixed, [row]), loss=loss)
     try:
         found = problem.solve(options, start=[poses], callback=callback)
@@ -130,29 +198,12 @@ def _let_go(
         P = found.covariance(variables[[row]])[0]
     except BoxplusError:  # a direction that no edge measures
         return None
-    off: NDArray[np.float64] = manifold.boxminus(found.values[0][[row]], poses[[row]])[0]
+    off: NDArray[np.float64] = _manifold(graph).boxminus(found.values[0][[row]], poses[[row]])[0]
     return off, float(off @ np.linalg.solve(P, off))
 
 
-def _sentence(
-    graph: PoseGraph,
-    witness: str,
-    worst: int,
-    rows: NDArray[np.int64],
-    off: NDArray[np.float64],
-    squared: NDArray[np.float64],
-    is_off: NDArray[np.bool_],
-) -> str:
-    """What the edges say of `rows[worst]` of the fixed poses, as the witness sees it."""
-    turn, shift = edge_parts(off.shape[1])
-    distance, angle = np.linalg.norm(off[worst, shift]), math.degrees(float(np.linalg.norm(off[worst, turn])))
-    more = np.count_nonzero(is_off) - 1
-    return (
-        f"the edges contradict the poses that the file fixes: as seen from {witness} they put pose {graph.ids[rows[worst]]} "
-        f"{distance:.3g} m and {angle:.3g} deg from where it is fixed, by {math.sqrt(squared[worst]):.3g} standard deviations"
-        + (f", and {more} more elsewhere" if more else "")
-        + ": one of these is wrong, or of another world, or the information of the edges claims too much"
-    )
+def _manifold(graph: PoseGraph) -> Manifold:
+    return SE3 if graph.dimension == 3 else SE2
 
 
 def _anchors(graph: PoseGraph) -> NDArray[np.int64]:
