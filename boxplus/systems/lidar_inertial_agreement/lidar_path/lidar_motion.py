@@ -27,7 +27,6 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, 
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import (
     FEWEST_USED,
     GOOD_MISFIT_M,
-    ROUGHLY,
     Turning,
     align,
     honest_information,
@@ -41,18 +40,18 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import (
 MOST_POINTS = 1500  # that a scan is registered with
 MOST_MAP_POINTS = 5000  # that it leaves in the map
 MOST_RAW = 12_000  # that it is undistorted and filtered from
-_STEPS = 16, 12, 8  # of a registration, and of further ones: the motion found may put other points into a voxel
+_PASSES = 3  # undistort, register: the motion found undistorts better than the one expected
 # The steps of a path have a floor of noise: a direction may count that says hardly more than noise.
 _WEAK = 0.7
 _INDEPENDENT_M = 0.5  # between points whose errors are independent
-_SAME_VOXELS = 0.25  # of a voxel that points may move against one another, within a scan, and stay together
+_SAME_MOTION = 2e-3  # rad and m between passes
 _COARSE, _FEW = 3, 300  # every so many points are enough for a first pass, where so many stay
+_ROUGHLY = 2e-3  # rad and m of the last step of a first pass, which a wrong motion has undistorted
 _FASTEST = 35.0, 70.0  # rad/s, m/s: beyond it a registration has gone astray
 _LEAST_SHARE = 0.1  # of the points lie on the map, or the scan is not registered; in an open field a fifth of them do at rest
 _SAME_START = 0.005, 0.02  # rad and m between two expectations
 _SAME_POSE = 0.002, 0.005  # rad and m between what first passes have come to
 _FIRST_SPEEDS = 5.0, 10.0  # m/s, both ways along every axis
-_MOST_TRIED, _ANOTHER_M_S = 4, 1.0  # of the speeds that are reached from them, and how far apart
 _MOST_SEARCHES = 3  # failures after which no speed is tried any more: it is not the speed
 _POOR = 1.5  # times the usual misfit: worth another guess
 _LONGEST_STEP_S = 1.0
@@ -189,21 +188,18 @@ class LidarMotion:
             best = self._again(first, scan, middle_ns, step_s, best, expected)
         if expected is not None or self._failed > _MOST_SEARCHES or (best is not None and best.misfit < GOOD_MISFIT_M):
             return best
-        kept, rate, found = self._tree, self._turning(middle_ns, step_s)[0], list[_Fit]()
+        kept, self._rate = (self._tree, self._rate, self._velocity), self._turning(middle_ns, step_s)[0]
+        found: _Fit | None = None
         for velocity in (speed * axis for speed in _FIRST_SPEEDS for axis in np.vstack([np.eye(3), -np.eye(3)])):
-            self._tree = self._map_of(first, rate, velocity)
-            found += filter(None, [self._register(scan, middle_ns, step_s, rate, velocity)])
-        # Before the map is made for it the right speed fits hardly better than others.
-        tried = [self._velocity if best is None else best.velocity]
-        for other in sorted(found, key=lambda fit: fit.cost):
-            if len(tried) > _MOST_TRIED or min(np.linalg.norm(other.velocity - velocity) for velocity in tried) < _ANOTHER_M_S:
-                continue
-            tried.append(other.velocity)
-            self._tree = self._map_of(first, other.rate, other.velocity)
-            again = self._register(scan, middle_ns, step_s, other.rate, other.velocity)
-            if again is not None and (best is None or again.cost < best.cost):
-                best, kept = again, self._tree
-        self._tree = kept
+            self._tree = self._map_of(first, self._rate, velocity)
+            fit = self._register(scan, middle_ns, step_s, self._rate, velocity)
+            if fit is not None and (found is None or fit.cost < found.cost):
+                found = fit
+        if found is not None:
+            found = self._again(first, scan, middle_ns, step_s, found, expected)
+        if found is not None and (best is None or found.cost < best.cost):
+            return found
+        self._tree, self._rate, self._velocity = kept
         return best
 
     def _again(self, first: Scan, scan: Scan, middle_ns: int, step_s: float, fit: _Fit, expected: Twist | None) -> _Fit | None:
@@ -275,7 +271,7 @@ class LidarMotion:
     def _roughly(self, x: NDArray[np.float64], points: NDArray[np.float32]) -> PoseDirections | None:
         """The first pass with some of the points, x (36,) in place; None, and x stays, where too few of them lie on the map."""
         near = x.copy()
-        directions = align(near, self._measurement(points[::_COARSE].copy()), self._of_few, settled=ROUGHLY)
+        directions = align(near, self._measurement(points[::_COARSE].copy()), self._of_few, settled=_ROUGHLY)
         if directions is not None:
             x[:] = near
         return directions
@@ -305,39 +301,28 @@ class LidarMotion:
         x[P : P + 3] = p_before + velocity * step_s
         directions: PoseDirections | None = None
         held = velocity / np.linalg.norm(velocity) if self._held and velocity.any() else None
-
-        def motion() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-            return so3.log(R_before.T @ x[R : R + 9].reshape(3, 3)) / step_s, (x[P : P + 3] - p_before) / step_s
-
-        def seen() -> NDArray[np.float32]:
-            # Within the scan the motion is what it has been found to be on the way here.
-            turning, going = motion()
-            return undistorted(scan, self._nodes(scan, middle_ns, turning, x[R : R + 9].reshape(3, 3).T @ going), middle_ns)
-
-        def follow() -> None:
-            points[:] = self._filter.means(seen())
-
-        for number, steps in enumerate(_STEPS):
-            rate, velocity = motion()
-            points = self._filter(seen())[0]
-            if number == 0 and reached is not None:
-                directions = self._roughly(x, points) if len(points) >= _FEW * _COARSE else None
-                if directions is not None:
-                    if any(_same_pose(x, other) for other in reached):
-                        return None
-                    reached.append(x.copy())
-                    continue
-            measurement = self._measurement(points)
-            directions = align(x, measurement, self._config, held=held, steps=steps, follow=follow)
+        for number in range(_PASSES):
+            # Within the scan the motion is what it was found to be on the way here.
+            nodes = self._nodes(scan, middle_ns, rate, x[R : R + 9].reshape(3, 3).T @ velocity)
+            still = undistorted(scan, nodes, middle_ns)
+            points = self._filter(still)[0]
+            roughly = number == 0 and reached is not None
+            directions = self._roughly(x, points) if roughly and len(points) >= _FEW * _COARSE else None
+            if directions is None:
+                measurement = self._measurement(points)
+                directions = align(x, measurement, self._config, held=held)
             if directions is None:
                 return None
-            turned, shifted = (
-                float(np.abs(now - chosen).max()) * step_s for now, chosen in zip(motion(), (rate, velocity), strict=True)
-            )
-            if turned * measurement.lever_arm + shifted < _SAME_VOXELS * self._filter.voxel_size:
+            if reached is not None:
+                if roughly and any(_same_pose(x, other) for other in reached):
+                    return None
+                reached.append(x.copy())
+            moved = so3.log(R_before.T @ x[R : R + 9].reshape(3, 3)) / step_s, (x[P : P + 3] - p_before) / step_s
+            change = max(np.abs(moved[0] - rate).max(), np.abs(moved[1] - velocity).max()) * step_s
+            rate, velocity = moved
+            if change < _SAME_MOTION and not roughly:
                 break
-        rate, velocity = motion()
-        information = measurement.at(x, rematch=measurement.has_moved(x))
+        information = measurement.at(x, rematch=reached is None or measurement.has_moved(x))
         # A point among map points of one scan line is not used, but it does lie on the map.
         on_line = measurement.rejected().get(REASONS[ONE_LINE], 0)
         share = (information.used + on_line) / max(len(points), 1)
@@ -358,7 +343,7 @@ class LidarMotion:
             directions.vectors[:, directions.weak],
             information.residual_rms,
             cost,
-            self._map_filter(seen())[1],
+            self._map_filter(still)[1],
         )
 
 

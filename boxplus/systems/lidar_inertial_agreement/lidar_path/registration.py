@@ -21,7 +21,6 @@ GOOD_MISFIT_M = 0.06  # of a registration that needs no second start
 FEWEST_USED = 60  # points on planes, or a scan is not registered
 _STEPS = 12
 SETTLED = 2e-4  # rad and m of the last step
-ROUGHLY = 2e-3  # where a wrong motion has undistorted the points
 _SIGMA_FLOOR = np.repeat([3e-4, 3e-3], 3)  # rad, m: surfaces are no planes, and neighbouring points share their errors
 
 _ENOUGH = 2.5 * FEWEST_USED  # points of a thinned scan: not all of them lie on planes
@@ -67,17 +66,13 @@ def align(
     steps: int = _STEPS,
     held: NDArray[np.float64] | None = None,
     settled: float = SETTLED,
-    follow: Callable[[], None] | None = None,
 ) -> PoseDirections | None:
     """Gauss-Newton on the pose alone, without the weak directions; x (36,) is replaced. None when too few points match.
 
     Along a unit axis `held` (3,), frame of the map, the position stays where it is. The last step is below `settled` [rad and m].
-    From when steps are small on, or have been many, `follow` moves the points of the measurement after each to where the new pose
-    says that they are: scans that a wrong motion has undistorted alike fit each other where they are.
     """
     delta = np.zeros(TANGENT)
     directions: PoseDirections | None = None
-    followed = follow is None
     for step in range(steps):
         information = measurement.at(x, rematch=step == 0 or measurement.has_moved(x))
         if information.used < config.min_points:
@@ -89,13 +84,7 @@ def align(
             A[3:6, 3:6] += _STIFF * float(np.trace(A[3:6, 3:6])) * np.outer(held, held)
         delta[:6] = strong_step(A, information.b, directions)
         boxplus_into(x, delta, x)
-        size = np.abs(delta).max()
-        if follow is not None and (size < ROUGHLY or step >= _STEPS):
-            follow()
-            followed, first = True, not followed
-            if first:
-                continue
-        if followed and size < settled:
+        if np.abs(delta).max() < settled:
             break
     return directions
 
