@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.formats.graphs.pose_graph import PoseGraph
+from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Loss
@@ -31,6 +32,11 @@ def edge_parts(dim: int) -> tuple[slice, slice]:
     return slice(0, split), slice(split, dim)
 
 
+def manifold_of(graph: PoseGraph) -> Manifold:
+    """Of the poses of a graph: those of space, or of the plane."""
+    return SE3 if graph.dimension == 3 else SE2
+
+
 def pose_graph_problem(
     graph: PoseGraph,
     *,
@@ -45,7 +51,7 @@ def pose_graph_problem(
     """
     problem = Problem()
     values = graph.poses if graph.poses is not None else spanning_tree_start(graph)
-    poses = problem.add_variables(SE3 if graph.dimension == 3 else SE2, values, name="poses")
+    poses = problem.add_variables(manifold_of(graph), values, name="poses")
     i, j = graph.edges.T
     problem.add_residuals(residual_of(graph, objective), poses[i], poses[j], loss=loss, name="edges")
     problem.fix(poses[held_poses(graph) if held is None else held])
@@ -56,7 +62,7 @@ def problem_with_loops_apart(graph: PoseGraph, is_loop: NDArray[np.bool_]) -> tu
     """The same with the logarithmic error, its edges in two groups: `ODOMETRY`, left out where there is none, and `LOOPS`."""
     problem = Problem()
     values = graph.poses if graph.poses is not None else spanning_tree_start(graph)
-    poses = problem.add_variables(SE3 if graph.dimension == 3 else SE2, values, name="poses")
+    poses = problem.add_variables(manifold_of(graph), values, name="poses")
     for name, rows in ((ODOMETRY, ~is_loop), (LOOPS, is_loop)):
         if rows.any():
             part = with_edges(graph, rows)

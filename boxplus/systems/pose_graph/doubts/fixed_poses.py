@@ -19,9 +19,6 @@ from numpy.typing import NDArray
 from boxplus._chi_square import chi_square_exceeded
 from boxplus.errors import BoxplusError
 from boxplus.formats.graphs.pose_graph import PoseGraph
-from boxplus.manifolds.manifold import Manifold
-from boxplus.manifolds.se2 import SE2
-from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.solver_options import SolverOptions
@@ -29,7 +26,7 @@ from boxplus.systems.pose_graph.doubts.fit import pose_names
 from boxplus.systems.pose_graph.doubts.reactions import Reactions
 from boxplus.systems.pose_graph.loops import judge_loops
 from boxplus.systems.pose_graph.named import named
-from boxplus.systems.pose_graph.problem import edge_parts, pose_graph_problem, with_edges
+from boxplus.systems.pose_graph.problem import edge_parts, manifold_of, pose_graph_problem, with_edges
 from boxplus.systems.pose_graph.start import components, spanning_tree_start
 
 _CHANCE = 5e-5  # that the worst of the fixed poses of a sound graph is told, by either way of asking
@@ -111,8 +108,10 @@ def _believed(
     watch: Callback | None,
 ) -> NDArray[np.bool_]:
     """(m,) edges to be asked: those kept, or, where some were refused, those that are kept without the poses to be let go."""
+    if is_loop is None or kept.all():
+        return kept
     anchors = _anchors(graph)
-    if is_loop is None or kept.all() or len(anchors) == len(graph.fixed):
+    if len(anchors) == len(graph.fixed):
         return kept
     loose = replace(graph, fixed=anchors)
     odometry = with_edges(loose, ~is_loop)
@@ -137,7 +136,7 @@ def _all_let_go(
         P = found.covariance(variables[judged])
     except BoxplusError:  # pieces of the graph that only the fixed poses held
         return None
-    off = _manifold(part).boxminus(found.values[0][judged], poses[judged])
+    off = manifold_of(part).boxminus(found.values[0][judged], poses[judged])
     dim = off.shape[1]
     turn, _ = edge_parts(dim)
     spare = dim * (len(part.edges) - len(part.ids) + len(np.unique(label)))
@@ -198,12 +197,8 @@ def _let_go(
         P = found.covariance(variables[[row]])[0]
     except BoxplusError:  # a direction that no edge measures
         return None
-    off: NDArray[np.float64] = _manifold(graph).boxminus(found.values[0][[row]], poses[[row]])[0]
+    off: NDArray[np.float64] = manifold_of(graph).boxminus(found.values[0][[row]], poses[[row]])[0]
     return off, float(off @ np.linalg.solve(P, off))
-
-
-def _manifold(graph: PoseGraph) -> Manifold:
-    return SE3 if graph.dimension == 3 else SE2
 
 
 def _anchors(graph: PoseGraph) -> NDArray[np.int64]:

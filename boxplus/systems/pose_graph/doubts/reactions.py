@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.formats.graphs.pose_graph import PoseGraph
-from boxplus.manifolds.se2 import SE2
-from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.minimizers.minimize import Callback
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.residuals.prior import Prior
-from boxplus.systems.pose_graph.problem import edge_parts, pose_graph_problem, residual_of
+from boxplus.systems.pose_graph.problem import edge_parts, manifold_of, pose_graph_problem, residual_of
 from boxplus.systems.pose_graph.start import components
 
 _STIFF = 30.0  # times all that the edges of a pose say of it
@@ -62,7 +60,7 @@ class Reactions:
         rows = graph.fixed[np.bincount(label[graph.fixed], minlength=len(graph.ids))[label[graph.fixed]] >= _FEWEST]
         if graph.poses is None or not len(rows):
             return None
-        manifold = SE3 if graph.dimension == 3 else SE2
+        manifold = manifold_of(graph)
         W = _STIFF * _stiffness(graph, graph.poses)[rows]
         problem, poses = pose_graph_problem(graph, held=np.setdiff1d(graph.fixed, rows), loss=loss)
         springs = W[:, :, None] * np.eye(W.shape[1])

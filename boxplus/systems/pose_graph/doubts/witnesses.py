@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.formats.graphs.pose_graph import PoseGraph
-from boxplus.manifolds.se2 import SE2
-from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.losses import Loss
 from boxplus.optimization.solver_options import SolverOptions
 from boxplus.sparse.graphs.components import connected_components
@@ -23,6 +21,7 @@ from boxplus.systems.pose_graph.doubts.fit import Fit, edge_names, misfit, stand
 from boxplus.systems.pose_graph.doubts.reliability import BENT, Reliability, Suspicion, suspicions
 from boxplus.systems.pose_graph.problem import (
     consecutive_edges,
+    manifold_of,
     pose_graph_problem,
     residual_of,
     squared_errors,
@@ -74,9 +73,8 @@ def held_against_each_other(
 
 def _pulled(known: Reliability, poses: NDArray[np.float64], graph: PoseGraph, doubtful: NDArray[np.bool_]) -> list[Suspicion]:
     """How far edges that no noise explains hold the result from where all others put it, under a loss that gives up none."""
-    manifold = SE3 if graph.dimension == 3 else SE2
     with np.errstate(divide="ignore", invalid="ignore"):
-        off = manifold.boxminus(poses, known.poses) / known.deviations
+        off = manifold_of(graph).boxminus(poses, known.poses) / known.deviations
     bent = float(np.abs(np.where(known.deviations > 0.0, off, 0.0)).max(initial=0.0))
     if not bent > BENT:
         return []
