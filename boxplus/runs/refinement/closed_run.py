@@ -19,7 +19,7 @@ from boxplus.runs.slam.gnss_output import located, read_origin
 from boxplus.runs.slam.graph_file import read_graph
 from boxplus.runs.slam.summary import SlamSummary, read_slam_summary
 from boxplus.runs.storage.output_folder import SUMMARY, program_of
-from boxplus.systems.refinement.outside import Receiver, RunFixes, RunLoops
+from boxplus.systems.refinement.outside.evidence import Receiver, RunFixes, RunLoops
 from boxplus.systems.slam.outcome import SlamOutcome
 
 Floats = NDArray[np.float64]

@@ -35,10 +35,10 @@ from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.run_loop import peak_memory_mb, versions
 from boxplus.systems.refinement.collecting import OdometryRows, collect
 from boxplus.systems.refinement.finished_run import FinishedRun
-from boxplus.systems.refinement.loops import contradicted
-from boxplus.systems.refinement.point_store import PointStore
+from boxplus.systems.refinement.outside.loops import contradicted
+from boxplus.systems.refinement.planes.point_store import PointStore
+from boxplus.systems.refinement.planes.sightings import lidar_poses
 from boxplus.systems.refinement.refinement import Refinement, refine
-from boxplus.systems.refinement.sightings import lidar_poses
 from boxplus.systems.refinement.state import RefinedState
 from boxplus.systems.refinement.unshown import is_mostly_unshown
 

@@ -20,8 +20,8 @@ from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.finished_run import FinishedRun
-from boxplus.systems.refinement.point_store import PointStore
-from boxplus.systems.refinement.slices import Slice, cut, slices_that_fit
+from boxplus.systems.refinement.planes.point_store import PointStore
+from boxplus.systems.refinement.planes.slices import Slice, cut, slices_that_fit
 from boxplus.systems.refinement.unshown import after_unshown, open_steps
 
 _LEAST_FOUND = 0.9  # of the odometry's scans, that the recording has

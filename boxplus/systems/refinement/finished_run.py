@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from boxplus.manifolds import quaternion
 from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.sensors.inertial.imu import ImuSamples
-from boxplus.systems.refinement.outside import RunFixes, RunLoops
+from boxplus.systems.refinement.outside.evidence import RunFixes, RunLoops
 from boxplus.systems.slam.correction import Correction
 
 Floats = NDArray[np.float64]

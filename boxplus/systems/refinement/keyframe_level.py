@@ -25,12 +25,12 @@ from boxplus.systems.refinement.calibrated import Calibrated
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.counted_less import covariances_of
 from boxplus.systems.refinement.finished_run import FinishedRun
-from boxplus.systems.refinement.fixes import add_fixes
 from boxplus.systems.refinement.inertial import GRAVITY, add_bias_prior, preintegrated
 from boxplus.systems.refinement.keyframes import Keyframes
-from boxplus.systems.refinement.loops import KeyframeLoops, between_keyframes
-from boxplus.systems.refinement.outside import Receiver
-from boxplus.systems.refinement.sightings import KeyframeClusters
+from boxplus.systems.refinement.outside.evidence import Receiver
+from boxplus.systems.refinement.outside.fixes import add_fixes
+from boxplus.systems.refinement.outside.loops import KeyframeLoops, between_keyframes
+from boxplus.systems.refinement.planes.sightings import KeyframeClusters
 from boxplus.systems.refinement.state import RefinedState
 from boxplus.systems.refinement.unshown import between, kept_steps
 from boxplus.systems.slam.correction import Correction

@@ -29,8 +29,8 @@ from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.inertial import MARGIN
 from boxplus.systems.refinement.keyframe_level import move_keyframes
 from boxplus.systems.refinement.keyframes import choose_keyframes
+from boxplus.systems.refinement.planes.sightings import judge, keyframe_clusters, lidar_poses, planes_of
 from boxplus.systems.refinement.scan_level import move_scans
-from boxplus.systems.refinement.sightings import judge, keyframe_clusters, lidar_poses, planes_of
 from boxplus.systems.refinement.state import RefinedState
 
 Floats = NDArray[np.float64]

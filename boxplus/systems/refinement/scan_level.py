@@ -18,7 +18,7 @@ from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.counted_less import covariances_of
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.inertial import GRAVITY, add_bias_prior, imu_counted, preintegrated
-from boxplus.systems.refinement.sightings import scan_forms, weights_of_slices
+from boxplus.systems.refinement.planes.sightings import scan_forms, weights_of_slices
 from boxplus.systems.refinement.state import RefinedState
 from boxplus.systems.refinement.unshown import kept_steps
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import quaternion, se3
-from boxplus.systems.refinement.outside import Receiver
+from boxplus.systems.refinement.outside.evidence import Receiver
 
 Floats = NDArray[np.float64]
 

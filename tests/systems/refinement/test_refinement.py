@@ -16,8 +16,8 @@ from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.refinement.collecting import OdometryRows, collect
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.keyframes import choose_keyframes
+from boxplus.systems.refinement.planes.sightings import weights_of_slices
 from boxplus.systems.refinement.refinement import refine
-from boxplus.systems.refinement.sightings import weights_of_slices
 from boxplus.systems.refinement.unshown import kept_steps
 from tests.systems.refinement.cases import Case
 from tests.systems.slam.drives import ate

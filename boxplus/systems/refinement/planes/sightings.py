@@ -16,7 +16,7 @@ from boxplus.residuals.planes.pose_quadratic import add_plane_forms
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.keyframes import Keyframes
-from boxplus.systems.refinement.sums_on_planes import add_to_sides, add_weighed, moved_clusters, points_that, sighted
+from boxplus.systems.refinement.planes.sums_on_planes import add_to_sides, add_weighed, moved_clusters, points_that, sighted
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -13,10 +13,10 @@ from boxplus.manifolds.se3 import SE3
 from boxplus.maps.plane_voxels.plane_map import PlaneMap
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.keyframes import Keyframes
-from boxplus.systems.refinement.loops import between_keyframes, contradicted
-from boxplus.systems.refinement.outside import Receiver, RunFixes, RunLoops
+from boxplus.systems.refinement.outside.evidence import Receiver, RunFixes, RunLoops
+from boxplus.systems.refinement.outside.loops import between_keyframes, contradicted
+from boxplus.systems.refinement.planes.sightings import KeyframeClusters
 from boxplus.systems.refinement.refinement import refine
-from boxplus.systems.refinement.sightings import KeyframeClusters
 from tests.systems.refinement.cases import Case
 from tests.systems.slam.drives import ate
 

@@ -10,7 +10,7 @@ from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.finished_run import FinishedRun
 from boxplus.systems.refinement.keyframes import Keyframes
-from boxplus.systems.refinement.sightings import judge, keyframe_clusters, planes_of, scan_forms
+from boxplus.systems.refinement.planes.sightings import judge, keyframe_clusters, planes_of, scan_forms
 
 STILL = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 SIGMA, FACES = 0.005, (2.20, 2.24)

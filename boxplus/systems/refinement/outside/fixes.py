@@ -19,7 +19,7 @@ from boxplus.residuals.gravity_direction import GravityDirection
 from boxplus.residuals.prior import Prior
 from boxplus.systems.georeference.attachment import poses_between
 from boxplus.systems.refinement.keyframes import Keyframes
-from boxplus.systems.refinement.outside import Receiver, RunFixes
+from boxplus.systems.refinement.outside.evidence import Receiver, RunFixes
 from boxplus.systems.refinement.state import RefinedState
 
 Floats = NDArray[np.float64]

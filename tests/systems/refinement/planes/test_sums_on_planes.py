@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from boxplus.manifolds import quaternion, so3
 from boxplus.systems.refinement.config import RefinementConfig
 from boxplus.systems.refinement.keyframes import choose_keyframes
-from boxplus.systems.refinement.sightings import lidar_poses, planes_of
-from boxplus.systems.refinement.sums_on_planes import moved_clusters, points_that, sighted
+from boxplus.systems.refinement.planes.sightings import lidar_poses, planes_of
+from boxplus.systems.refinement.planes.sums_on_planes import moved_clusters, points_that, sighted
 from tests.systems.refinement.cases import Case
 
 

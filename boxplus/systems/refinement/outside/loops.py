@@ -16,8 +16,8 @@ from boxplus.manifolds import quaternion, se3, so3
 from boxplus.maps.plane_voxels.plane_map import PlaneMap
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.systems.refinement.keyframes import Keyframes
-from boxplus.systems.refinement.outside import RunLoops
-from boxplus.systems.refinement.sightings import KeyframeClusters
+from boxplus.systems.refinement.outside.evidence import RunLoops
+from boxplus.systems.refinement.planes.sightings import KeyframeClusters
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

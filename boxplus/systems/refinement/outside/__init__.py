@@ -1,0 +1,1 @@
+"""What a run knows beside its scans and its IMU, as measurements of keyframes."""

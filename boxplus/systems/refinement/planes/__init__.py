@@ -1,0 +1,1 @@
+"""What the points of scans say of planes, however many points there are."""
