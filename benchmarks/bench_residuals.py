@@ -27,7 +27,7 @@ from boxplus.manifolds.user_manifold import UserManifold
 from boxplus.optimization.problem import Problem
 from boxplus.residuals.relative_pose import RelativePose
 from boxplus.residuals.residual import Residual
-from boxplus.residuals.user_residual import UserResidual
+from boxplus.residuals.user.residual import UserResidual
 
 BAR_SOLVE = 2.0
 BAR_EDGE_NS = 250.0

@@ -25,7 +25,7 @@ from boxplus._user_code import UserCode, snapshot
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.optimization.losses import UserLoss
 from boxplus.optimization.user_loss import compiled_loss
-from boxplus.residuals.user_residual import UserResidual
+from boxplus.residuals.user.residual import UserResidual
 
 compiles = pytest.mark.skipif(bool(numba_config.DISABLE_JIT), reason="nothing is compiled")
 

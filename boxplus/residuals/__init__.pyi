@@ -33,4 +33,4 @@ from .relative_pose import RelativePose as RelativePose
 from .relative_pose_2d import RelativePose2D as RelativePose2D
 from .residual import Linearization as Linearization
 from .residual import Residual as Residual
-from .user_residual import UserResidual as UserResidual
+from .user.residual import UserResidual as UserResidual

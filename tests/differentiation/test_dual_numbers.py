@@ -15,7 +15,7 @@ from boxplus.differentiation import slopes
 from boxplus.errors import InputError
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.optimization.jacobian_check import check_jacobian
-from boxplus.residuals.user_residual import UserResidual
+from boxplus.residuals.user.residual import UserResidual
 
 pytestmark = pytest.mark.skipif(bool(numba_config.DISABLE_JIT), reason="what is not compiled is not differentiated")
 

@@ -217,7 +217,7 @@ CASES: dict[str, Callable[[np.random.Generator], Case]] = {
     "ReprojectionIntrinsics": _intrinsics,
     "ReprojectionTiedIntrinsics": _tied_intrinsics,
 }
-# Its Jacobians are the user's: test_user_residual.py.
+# Its Jacobians are the user's: user/test_residual.py.
 NOT_SHIPPED = {"UserResidual"}
 
 

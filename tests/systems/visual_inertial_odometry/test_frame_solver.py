@@ -11,7 +11,7 @@ import pytest
 import boxplus as bp
 from boxplus.manifolds.euclidean import Euclidean
 from boxplus.optimization.problem import Problem
-from boxplus.residuals.user_residual import UserResidual
+from boxplus.residuals.user.residual import UserResidual
 from boxplus.systems.visual_inertial_odometry.frame_solver import FrameSolver
 
 _STEPS = 4

@@ -15,7 +15,7 @@ from boxplus.manifolds.quaternion import multiply_scalars, rotate
 from boxplus.manifolds.se3 import between_into, between_scalars, log_scalars
 from boxplus.manifolds.tangents.basis import tangent_basis_into
 from boxplus.manifolds.tangents.step import tangent_steps
-from boxplus.residuals.user_residual import UserResidual
+from boxplus.residuals.user.residual import UserResidual
 
 compiles = pytest.mark.skipif(bool(numba_config.DISABLE_JIT), reason="what is not compiled is not differentiated")
 

@@ -30,7 +30,7 @@ from boxplus._user_loops import (
 )
 from boxplus.manifolds.manifold import Manifold
 from boxplus.manifolds.tangents.step import copy_into, step_into, tangent_steps
-from boxplus.residuals.user_automatic import NotDifferentiableError, automatic_loop
+from boxplus.residuals.user.automatic import NotDifferentiableError, automatic_loop
 
 Derivative = Literal["analytic", "automatic", "numeric"]
 

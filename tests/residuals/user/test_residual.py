@@ -22,7 +22,7 @@ from boxplus.manifolds.so3 import SO3
 from boxplus.optimization.jacobian_check import check_jacobian
 from boxplus.optimization.problem import Problem
 from boxplus.residuals.relative_pose import RelativePose
-from boxplus.residuals.user_residual import UserResidual
+from boxplus.residuals.user.residual import UserResidual
 
 
 def relative_pose(T_i, T_j, z):
@@ -330,7 +330,7 @@ def test_wrong_functions_are_explained() -> None:
         UserResidual(wrong_name, **options)
     with pytest.raises(InputError, match=r"got foreign: No implementation of function .*svd.* found for signature: svd\(array"):
         UserResidual(foreign, **options)
-    with pytest.raises(InputError, match=r"Unknown attribute 'rotation' of type .* \(test_user_residual.py, line \d+\)"):
+    with pytest.raises(InputError, match=r"Unknown attribute 'rotation' of type .* \(test_residual.py, line \d+\)"):
         UserResidual(attribute, **options)
     with pytest.raises(InputError, match="expected a jacobian that Numba can compile – got relative_pose_jacobian"):
         UserResidual(relative_pose, jacobian=relative_pose_jacobian, **options)

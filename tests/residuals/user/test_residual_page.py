@@ -12,9 +12,9 @@ from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.jacobian_check import check_jacobian
 from boxplus.optimization.problem import Problem
 from boxplus.residuals.relative_pose import RelativePose
-from boxplus.residuals.user_residual import UserResidual
+from boxplus.residuals.user.residual import UserResidual
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[3] / "docs"
 
 
 def _programs(page: str) -> list[str]:

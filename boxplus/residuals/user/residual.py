@@ -13,7 +13,7 @@ from boxplus._numbers import as_array, as_floats
 from boxplus.errors import InputError
 from boxplus.manifolds.manifold import Manifold
 from boxplus.residuals.residual import Array, Arrays, Mask, Residual, Rows
-from boxplus.residuals.user_kernels import Derivative, Loops, compiled_loops
+from boxplus.residuals.user.kernels import Derivative, Loops, compiled_loops
 from boxplus.residuals.whitening import Whitening
 
 _STEP = 1e-5  # of central differences: truncation and rounding both stay below about 1e-10
