@@ -9,7 +9,8 @@ it by less than it claims to be known.
 
 The fit with two datums bends the odometry before it lets a datum jump, as a fix counts for little beside those near to it in
 time: of a usual receiver much of a step may stay. Then the step itself is asked, from near (`step`), which also tells bursts
-from datums.
+from datums. Fixes known to centimetres may be gated here or there at nearly the same cost, so that how many are says little, and
+that fit may end with a datum that is wrong itself: a step that is far beyond noise needs no word of it.
 """
 
 from __future__ import annotations
@@ -106,14 +107,15 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
         # A burst at the step hides what another datum leaves of it.
         is_left = gated <= before and (step.is_beside or (share < _LESS and step.is_told))
         is_left = is_left and _rests_on_both(found, seconds, int(at[largest]), step)
+        is_sure = not is_short and step.is_sure and _least_used(found, seconds, int(at[largest])) >= _SIDE_USED
         metres, bend = float(np.linalg.norm(split.datum_step[:2])), _bend(found, split)
         # Fixes on both sides were gated against a map between the two: a burst gives none of the others back, and chance a
         # few.
         gives_back = freed >= _WINDOW and gated <= _HALF * before and bend > OFF_SIGMAS
         is_seen = max(step.gain, step.burst_gain, step.beside) >= _SEEN
-        if is_seen and (gives_back or (not step.is_burst and (is_explained or is_left))):
+        if is_seen and (gives_back or (not step.is_burst and (is_explained or is_left or is_sure))):
             # Of the map that lies bent between both the errors step by less: it goes along.
-            told = metres if is_explained or gives_back else max(metres, step.alone)
+            told = metres if is_explained or gives_back else max(metres, step.alone) if is_left else step.alone
             jump = Jump(float(seconds[at[largest]]), told, not is_short, bend)
             if jump.lasts:
                 return jump
@@ -126,10 +128,15 @@ def _rests_on_both(found: Fit, seconds: Floats, at: int, step: Step) -> bool:
 
     One that rests on the fixes of one side lies in their datum; what is on the other is another question (`plateau`).
     """
+    reach = float(np.linalg.norm(found.errors[found.is_used, :2], axis=1).max(initial=0.0))
+    return _least_used(found, seconds, at) >= _SIDE_USED and step.alone <= 2.0 * reach
+
+
+def _least_used(found: Fit, seconds: Floats, at: int) -> float:
+    """Share of the fixes near to a step that are used, on the side on which it is less; none where there are none."""
     near = np.abs(seconds - seconds[at]) <= _LASTING
     sides = found.is_used[:at][near[:at]], found.is_used[at:][near[at:]]
-    reach = float(np.linalg.norm(found.errors[found.is_used, :2], axis=1).max(initial=0.0))
-    return min(float(side.mean()) for side in sides) >= _SIDE_USED and step.alone <= 2.0 * reach
+    return min(float(side.mean()) if len(side) else 0.0 for side in sides)
 
 
 def _bend(found: Fit, split: Fit) -> float:

@@ -98,6 +98,12 @@ def test_a_map_between_two_datums_is_not_to_be_trusted(laps: Drive, receiver: di
     assert jumped.contradiction.startswith("fixes jump by ") and "the map lies between the two" in jumped.contradiction
 
 
+def test_a_step_far_beyond_noise_is_a_jump_whatever_the_fit_with_two_datums_gates() -> None:
+    """That fit gated two fixes more than the one with one datum, at nearly the same cost: a map 5.7 standard deviations off."""
+    jumped = found(drive(LAPS, 15), GOOD.model_copy(update={**PRECISE, "jump": (0.4, 0.3, 0.0)}))
+    assert jumped.refusal is None and jumped.contradiction is not None and "fixes jump by " in jumped.contradiction
+
+
 def test_a_jump_is_as_long_as_two_datums_are_apart(laps: Drive) -> None:
     """Of the map that lies between them the errors step by less."""
     between = found(laps, GOOD.model_copy(update={**PRECISE, "jump": (1.2, 0.9, 0.0)}))

@@ -89,11 +89,21 @@ def test_bursts_in_a_row_are_no_step(bursts: list[tuple[float, tuple[float, floa
 
 def test_what_an_odometry_drifts_at_random_is_no_step_and_a_jump_is_one() -> None:
     random = np.random.default_rng(1)
-    sigma, told, jumps = 0.02, 0, 0
+    sigma, told, jumps, sure = 0.02, 0, 0, 0
     for _ in range(40):
         walked = np.cumsum(np.full(len(SECONDS), 0.03**2))
         drift = np.cumsum(0.03 * random.standard_normal((len(SECONDS), 2)), axis=0)
         errors = drift + 0.01 * random.standard_normal((len(SECONDS), 2))
         told += step_at(SECONDS, errors, 50, sigma, walked).is_told
         jumps += step_at(SECONDS, errors + np.outer(SECONDS >= 50.0, [0.4, 0.0]), 50, sigma, walked).is_told
-    assert told == 0 and jumps >= 36
+        sure += step_at(SECONDS, errors + np.outer(SECONDS >= 50.0, [0.5, 0.0]), 50, sigma, walked).is_sure
+        burst = np.outer((SECONDS >= 50.0) & (SECONDS < 65.0), [1.0, 0.0])
+        assert not step_at(SECONDS, errors + burst, 50, sigma, walked).is_sure
+    assert told == 0 and jumps >= 36 and sure >= 36
+
+
+def test_in_a_gap_of_a_minute_there_is_no_step() -> None:
+    """Fixes 10 s apart and a gap of 90 s: no fix lies within reach of the middle of it, which was an IndexError."""
+    seconds = np.concatenate([np.arange(0.0, 150.0, 10.0), np.arange(230.0, 400.0, 10.0)])
+    step = step_at(seconds, np.outer(seconds > 200.0, [5.0, 0.0]), 15, 0.02)
+    assert step.gain == 0.0 and not step.is_told and not step.is_sure
