@@ -9,7 +9,9 @@ import pytest
 
 from boxplus.manifolds import so3
 from boxplus.maps.plane_measurement import PlaneMeasurement
-from boxplus.simulation import Simulation
+from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar
+from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.worlds import sites, worlds
 from boxplus.systems.lidar_inertial_agreement.lidar_path import track
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
@@ -70,3 +72,19 @@ def test_what_is_held_along_the_way_is_registered_with_all_points(monkeypatch: p
     scans, _ = data(simulation)
     monkeypatch.setattr(track.Track, "_roughly", None)  # nothing asks for it
     assert lidar_path(scans[:6], CONFIG, expected=true_twists(simulation, scans[:6]), held=True).failed == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("world", "channels", "seed"),
+    [("warehouse", 16, 22), ("warehouse", 32, 24), ("city", 64, 22), ("hall", 16, 24), ("hall", 32, 22), ("hall", 64, 24)],
+)
+def test_a_path_begins_at_the_speed_of_its_first_scans(world: str, channels: int, seed: int) -> None:
+    places = {"warehouse": sites.warehouse, "city": worlds.city, "hall": worlds.hall}
+    motion = manoeuvres.constant_velocity(1.3, (-5.6, 0.3, 1.6), (14.0, 0.0, 0.0), so3.exp(np.array([0.0, 0.0, 0.2])))
+    lidar = SpinningLidar(channels=channels, azimuth_steps=512)
+    simulation = Simulation(Scenario(world, places[world](seed=seed), motion, lidar, ImuModel(), np.eye(4)), seed, 0.7)
+    path = lidar_path(data(simulation)[0], CONFIG)
+    assert path.failed == 0 and len(path) == 6
+    metres, radians = errors(path, simulation)  # of 7 m
+    assert metres < 0.05 and radians < 0.005
