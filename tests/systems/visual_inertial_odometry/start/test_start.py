@@ -113,6 +113,17 @@ def test_too_short_too_few_and_gaps_are_named(bench) -> None:
     assert "a gap of 0.3" in str(find_start(drawn.seen[:41], holed, drawn.rig, CONFIG))
 
 
+@pytest.mark.parametrize(("motion", "cameras"), [("flying", 1), ("handheld", 2)])
+def test_no_start_ends_in_frames_that_see_nothing(bench, motion, cameras) -> None:
+    """A lens that is covered at the end: nothing holds the pose that the run would begin with."""
+    drawn = bench.draw(seed_of(bench, motion, cameras))
+    seen = drawn.seen[:61]
+    assert isinstance(find_start(seen, drawn.imu, drawn.rig, CONFIG), Start)
+    few = [replace(t, ids=t.ids[:3], pixels=t.pixels[:3], rays=t.rays[:3], is_new=t.is_new[:3]) for t in seen[-4:]]
+    said = str(find_start([*seen[:-4], *few], drawn.imu, drawn.rig, CONFIG))
+    assert "corners are in the newest frame (6 are needed): it is blind" in said
+
+
 def test_a_saturated_gyroscope_is_refused(bench) -> None:
     drawn = bench.draw(seed_of(bench, "flying", 2))
     random = np.random.default_rng(0)
