@@ -26,6 +26,7 @@ from boxplus.runs.lidar_inertial.config import MapConfig, RunConfig
 from boxplus.runs.lidar_inertial.extrinsic import choose_extrinsic
 from boxplus.runs.lidar_inertial.odometry_run import run_odometry
 from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
+from boxplus.runs.vague_pose import largest_sigmas
 from boxplus.simulation import Fault, Simulation, as_recording, write_recording
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from lio_campaign.draws import Draw, draw
@@ -274,6 +275,5 @@ def _last_sigmas(estimate: Trajectory | None) -> dict[str, float]:
     """How well a run claims to know its last pose, along the axis that it knows least: rotation [deg] and position [m]."""
     if estimate is None or estimate.covariance is None:
         return {}
-    P = estimate.covariance[-1]
-    turn, place = (np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0)) for block in (P[:3, :3], P[3:, 3:]))
-    return {"last_sigma_deg": round(float(np.rad2deg(turn)), 3), "last_sigma_m": round(float(place), 4)}
+    turn, place = largest_sigmas(estimate.covariance[-1])
+    return {"last_sigma_deg": round(float(np.rad2deg(turn)), 3), "last_sigma_m": round(place, 4)}

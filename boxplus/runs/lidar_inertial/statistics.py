@@ -5,23 +5,21 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from boxplus._words import either
 from boxplus.filtering.nav_state import T_THETA_L
 from boxplus.runs.estimate_statistics import EstimateStatistics, GapWatch
 from boxplus.runs.lidar_inertial.first_points import first_points_of
 from boxplus.runs.run_facts import Gap, WarningFacts
+from boxplus.runs.vague_pose import is_vague, largest_sigmas, length_text
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING
 
-_VAGUE_M, _VAGUE_SHARE = 0.05, 0.02  # of the way: a position less certain than both is of little use
-_UNKNOWN_M, _UNKNOWN_SHARE = 1.0, 0.2  # and one less certain than these is of none
+_UNKNOWN_M, _UNKNOWN_SHARE = 1.0, 0.2  # of the way: a position less certain than both is of no use
 _VAGUE_DEG = 2.0  # of a rotation
 
-_PARTS = slice(0, 3), slice(3, 6)  # of the covariance of a pose: rotation, position
 _LATE_S = 1.0  # a start in motion may take as long, and a second without a path is not missed
 
 
@@ -62,13 +60,13 @@ class RunStatistics(EstimateStatistics):
             self.warnings.add(text, estimate.time_ns)
         self.T_imu_lidar[:3, :3], self.T_imu_lidar[:3, 3] = estimate.state.R_imu_lidar, estimate.state.p_imu_lidar
         self._mounting_covariance = estimate.covariance[T_THETA_L:, T_THETA_L:]
-        turn, shift = _largest_sigmas(estimate.pose_covariance)
+        turn, shift = largest_sigmas(estimate.pose_covariance)
         self._rotation_sigma_deg, self._position_sigma_m = float(np.degrees(turn)), shift
 
     @property
     def mounting_sigma(self) -> tuple[float, float]:
         """How uncertain the last T_imu_lidar is where that is most: rotation [deg] and translation [m]."""
-        turn, arm = _largest_sigmas(self._mounting_covariance)
+        turn, arm = largest_sigmas(self._mounting_covariance)
         return float(np.degrees(turn)), arm
 
     def vague_warnings(self, mounting_sigma: tuple[float, float] | None) -> list[WarningFacts]:
@@ -88,8 +86,8 @@ class RunStatistics(EstimateStatistics):
 
     def _told_of_pose(self, mounting_sigma: tuple[float, float] | None) -> str | None:
         little = []
-        if self._position_sigma_m > max(_VAGUE_M, _VAGUE_SHARE * self.path_length_m):
-            little.append(f"position to {_length(self._position_sigma_m)}")
+        if is_vague(self._position_sigma_m, self.path_length_m):
+            little.append(f"position to {length_text(self._position_sigma_m)}")
         if self._rotation_sigma_deg > _VAGUE_DEG:
             little.append(f"rotation to {self._rotation_sigma_deg:.1f} deg")
         if not little:
@@ -102,7 +100,7 @@ class RunStatistics(EstimateStatistics):
             why.append(f"{open_scans} of {self.count} scans left directions open")
         return (
             f"by its own covariance the run knows its last {' and its last '.join(little)} (1 sigma) only, after a "
-            f"way of {_length(self.path_length_m)}: {', and '.join(why) or 'its start, its IMU and what it saw tell no more'}"
+            f"way of {length_text(self.path_length_m)}: {', and '.join(why) or 'its start, its IMU and what it saw tell no more'}"
         )
 
     def late_start_warnings(self, unstarted: int, refusal: str | None) -> list[WarningFacts]:
@@ -129,16 +127,6 @@ class RunStatistics(EstimateStatistics):
     def scan_gaps(self) -> list[Gap]:
         """Intervals between the ends of scans more than three times the usual one."""
         return self._scan_gaps.gaps(self.first_time_ns or 0) if self.first_time_ns is not None else []
-
-
-def _largest_sigmas(P: NDArray[np.float64]) -> tuple[float, float]:
-    """Standard deviations along the axes that a pose's covariance (6, 6) knows least: rotation [rad], position [m]."""
-    turn, shift = (float(np.sqrt(max(np.linalg.eigvalsh(P[part, part])[-1], 0.0))) for part in _PARTS)
-    return turn, shift
-
-
-def _length(metres: float) -> str:
-    return f"{metres * 100:.0f} cm" if metres < 1.0 else f"{metres:.1f} m"
 
 
 def _trouble(estimate: Estimate) -> str:

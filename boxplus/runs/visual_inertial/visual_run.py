@@ -23,6 +23,7 @@ from boxplus.runs.cameras.turning import Turning
 from boxplus.runs.inspection.imu_checks import doubt_of_gravity
 from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_loop import Progress
+from boxplus.runs.vague_pose import is_vague, largest_sigmas, length_text
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
 from boxplus.runs.visual_inertial.frame_log import FrameLogWriter
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
@@ -45,7 +46,7 @@ _TOLD = {
 }  # of the tests of a start; `run.json` has all of them
 _OWN_STATE = (
     "_images", "_rejected", "_lines_rejected", "_keyframes", "_before_start", "_mountings", "_time_offset_s",
-    "_troubled_ns", "_turning", "_image_gaps", "_refusal",
+    "_troubled_ns", "_turning", "_image_gaps", "_refusal", "_worst_sigma_m",
 )  # fmt: skip
 _MUCH_LOST, _MUCH_DOUBTED = 0.15, 0.5  # shares of the frames, of the second those that are weak as well: a cause is looked for
 _MOST_LOST = 0.5  # share of the frames from which on the whole run is not to be trusted
@@ -139,6 +140,7 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         self._time_offset_s = 0.0
         self._troubled_ns: int | None = None
         self._refusal: str | None = None  # why the last frame without a start gave none
+        self._worst_sigma_m = 0.0  # of the positions of frames that are called ok
         self._causes: list[str] = []
         self._refuted: str | None = None  # the first cause with which nothing that was measured can be trusted
         self._doubts: list[str] = []
@@ -228,6 +230,8 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         if self.is_new(estimate.time_ns):
             self._trajectory.append(estimate.time_ns, T[:3, :3], T[:3, 3], covariance, estimate.status)
             self._frames.append(estimate, stages)
+        if estimate.status == "ok":
+            self._worst_sigma_m = max(self._worst_sigma_m, largest_sigmas(covariance)[1])
         trouble = f"began with: {'; '.join(estimate.reasons)}"
         self.counts.add_estimate(estimate.time_ns, T[:3, 3], estimate.status, stages, trouble)
         if estimate.is_keyframe:
@@ -273,6 +277,13 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
                 "part of the platform in view, or the middle of a circle that it moved on; they were left out"
             )
             shared["warnings"].append(WarningFacts(text=text, count=carried))
+        if is_vague(self._worst_sigma_m, counts.path_length_m):
+            text = (
+                f"by its own covariance the run knows some positions to {length_text(self._worst_sigma_m)} (1 sigma) only, of "
+                f"a way of {length_text(counts.path_length_m)}, in frames that are called ok: its start, its IMU and what it "
+                "saw tell no more"
+            )
+            shared["warnings"].append(WarningFacts(text=text, count=1))
         doubts = self._doubts if start is None else [*gravity_doubts(start, len(self._rig.cameras)), *self._doubts]
         shared["warnings"] += [WarningFacts(text=doubt, count=1) for doubt in doubts]
         shared["warnings"] += [WarningFacts(text=f"{MAY_BE}: {cause}", count=1) for cause in self._causes]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -41,6 +42,7 @@ from boxplus.simulation.cameras import as_camera_recording, make_camera_fault, m
 from boxplus.simulation.cameras.faults import CameraFault, covered_lens
 from boxplus.systems.visual_inertial_odometry import VioConfig, VioEstimate
 from boxplus.systems.visual_inertial_odometry.corners.carried import CARRIED
+from boxplus.systems.visual_inertial_odometry.odometry import VisualInertialOdometry
 from tests.report.unpacked import figures_of
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="corners are followed with OpenCV")
@@ -95,6 +97,20 @@ def test_a_run_without_trouble_says_that_its_shutter_rolls(tmp_path: Path, rolli
     said = [warning.text for warning in summary.warnings if "a rolling shutter is suspected" in warning.text]
     assert len(said) == rolling
     assert read_vio_summary(VioFolder(tmp_path / "out").summary).warnings == summary.warnings
+
+
+def test_positions_of_which_a_run_knows_little_are_told(
+    recorded: Path, finished: tuple[VioFolder, VioSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert not any("own covariance" in warning.text for warning in finished[1].warnings)
+    for name in ("push_image", "push_imu"):
+        original = getattr(VisualInertialOdometry, name)
+        vague = lambda self, event, original=original: [replace(e, covariance=1e6 * e.covariance) for e in original(self, event)]  # noqa: E731
+        monkeypatch.setattr(VisualInertialOdometry, name, vague)
+    with open_camera_recording(recorded) as recording:
+        summary = run_visual_odometry(recording, tmp_path / "out", CONFIG)
+    (text,) = (warning.text for warning in summary.warnings if "own covariance" in warning.text)
+    assert re.search(r"knows some positions to \d.* m \(1 sigma\) only, of a way of \d+ cm", text)
 
 
 def test_every_frame_with_a_state_has_a_row_everywhere(finished: tuple[VioFolder, VioSummary]) -> None:
