@@ -403,6 +403,7 @@ def test_a_clock_that_steps_back_is_the_first_warning(tmp_path: Path) -> None:
     assert re.match(r"the times of the IMU step back by (3600\.0|3599\.9)\d* s after", imu)
 
 
+@pytest.mark.slow
 def test_a_path_that_begins_late_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = simulate("walk", duration_s=3.6, lidar=LIDAR)
     begin_ns = simulation.start_ns + 2_200_000_000

@@ -58,6 +58,7 @@ def resumed(folder: SlamFolder, monkeypatch: pytest.MonkeyPatch) -> Any:
     return CliRunner().invoke(app, words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize(("odometry", "rows"), [("running", 5), ("failed", 5), ("running", 0), (None, 0)])
 def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(

@@ -296,6 +296,7 @@ def test_no_start_in_the_whole_recording_is_an_error_with_its_number(tmp_path: P
     assert summary.state == "failed" and summary.start is None and summary.frames_before_start > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("covered_s", [0.0, 5.0])
 def test_frames_without_a_pose_are_told_where_the_start_comes_late(tmp_path: Path, covered_s: float) -> None:
     """Of 200 frames 114 had no pose, of which nothing but their number was said."""

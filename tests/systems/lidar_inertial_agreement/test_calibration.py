@@ -48,6 +48,7 @@ def test_mounting_clocks_and_scales_are_found(calibrations: list[tuple[np.ndarra
         assert abs(error[SCALE]) < 0.005
 
 
+@pytest.mark.slow
 def test_the_stated_covariances_hold(calibrations: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
     """NEES per degree of freedom, over all seeds: not overconfident, and not so wide that it says nothing."""
     joint = [error @ np.linalg.solve(covariance, error) / 9 for error, covariance, _ in calibrations]

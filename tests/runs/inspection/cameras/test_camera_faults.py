@@ -359,6 +359,7 @@ def test_a_simulated_recording_says_what_is_wrong_with_it(filmed: CameraSimulati
         assert key in wrong and fault.named_in(" ".join(evidence.text for evidence in wrong.values()))
 
 
+@pytest.mark.slow
 @needs_cv2
 def test_a_rest_before_the_motion_leaves_camera_and_gyroscope_alike() -> None:
     """Between images that stand any rotation fits: half a minute of rest passed for a gyroscope of another platform."""

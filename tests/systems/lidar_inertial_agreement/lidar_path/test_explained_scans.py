@@ -97,6 +97,7 @@ def test_of_a_path_forwards_and_one_backwards_the_better_one_is_taken() -> None:
     assert surer_path(truth, scans, CONFIG, ()) is truth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3])
 def test_sways_after_a_rest_show_the_gyroscopes_scale(seed: int) -> None:
     """The pattern of the rest, and turns that change within a scan, make a first path turn too little or too much."""

@@ -250,6 +250,7 @@ def _shaken(frame: Frame, seed: int) -> Frame:
     return replace(frame, imu=ImuSamples(frame.imu.time_ns, frame.imu.gyro + 0.3 * noise, frame.imu.accel + 3.0 * noise))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("swing", [0.4, 0.3, 0.2])
 def test_a_swing_that_ends_as_it_began_is_no_rest(swing: float) -> None:
     """To and fro about the vertical, once while the start is watched."""
@@ -299,6 +300,7 @@ def test_a_moving_start_that_asks_for_a_bias_that_no_accelerometer_in_order_has_
         assert named is not None and 0.4 < float(named[1]) < 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_an_accelerometer_with_the_opposite_sign_is_named_in_motion(seed: int) -> None:
     """The path of a lively hand fits it to millimetres one way, to centimetres the other; of a sound one nothing is said."""

@@ -39,6 +39,7 @@ def test_information_in_another_unit_or_inverted_is_named(dimension: int, seed: 
         assert told in (optimize_pose_graph(wrong).doubt or "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_units_of_both_and_of_covariances_are_named(dimension: int, seed: int) -> None:
