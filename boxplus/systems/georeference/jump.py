@@ -101,7 +101,9 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
             continue
         share = float(_steps(split.errors)[largest] / steps[largest])
         gated, before = (int(np.count_nonzero(~own.is_used)) for own in (split, found))
-        step = _sharpest(seconds, attached, found, int(at[largest]), sigma)
+        # Fixes that state more than most do, as receivers do that lose theirs for a while, are judged by that.
+        beside = max(sigma, found.noise_scale * _sigma_beside(attached, seconds, int(at[largest])))
+        step = _sharpest(seconds, attached, found, int(at[largest]), beside)
         freed = before - gated
         is_explained = freed >= 0 if share < _GONE else share < _LESS and freed >= _WINDOW and gated < _FEWER * before
         # A burst at the step hides what another datum leaves of it.
@@ -121,6 +123,13 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
                 return jump
             short = jump
     return short
+
+
+def _sigma_beside(attached: AttachedFixes, seconds: Floats, at: int) -> float:
+    """What the fixes near to a step state, on the side on which it is more [m]."""
+    near = np.abs(seconds - seconds[at]) <= _LASTING
+    sides = attached.sigma[:at][near[:at]], attached.sigma[at:][near[at:]]
+    return max(float(np.median(side)) if len(side) else 0.0 for side in sides)
 
 
 def _rests_on_both(found: Fit, seconds: Floats, at: int, step: Step) -> bool:

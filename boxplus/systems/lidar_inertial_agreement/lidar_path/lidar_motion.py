@@ -19,7 +19,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, 
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 from boxplus.systems.lidar_inertial_agreement.lidar_path.track import Track
 
-_FOLLOWED = 5  # poses of a track, after which the others that began with it are given up
+_FOLLOWED = 5  # poses of a track, the first two included, after which the others that began with it are given up
 
 
 def lidar_path(
@@ -47,19 +47,25 @@ def lidar_path(
     """
     tracks = [Track(config, guesses, undistort=undistort, velocity=velocity, held=held)]
     for number, scan in enumerate(scans):
+        best = _best(tracks)
         tracks = [one for track in tracks for one in track.add(scan, None if expected is None else expected[number])]
-        tracks = _worth_following(tracks)
+        tracks = _worth_following(tracks, best)
         if unbroken and tracks[0].failed:
             break
     return _best(tracks).path()
 
 
-def _worth_following(tracks: Sequence[Track]) -> list[Track]:
-    """Of tracks through the same scans those that may be right: one, where later scans have told."""
+def _worth_following(tracks: Sequence[Track], best: Track) -> list[Track]:
+    """Of tracks through the same scans those that may be right: one, where later scans have told.
+
+    Args:
+        tracks: after a scan.
+        best: the one that had fitted best before it.
+    """
     failed = min(track.failed for track in tracks)
     left = [track for track in tracks if track.failed == failed]
-    if left[0].length <= 1:  # they have lost hold together, and begin anew where they all are
-        return left[:1]
+    if left[0].length <= 1:  # they have lost hold together, and begin anew where the best one is
+        return [best if best in left else left[0]]
     return left if left[0].length < _FOLLOWED else [_best(left)]
 
 

@@ -1,7 +1,6 @@
 """A path of the LiDAR that grows scan by scan: each is registered to a map of those before it, from where it is expected.
 
-A first and a second scan may fit each other at several speeds. Then the track forks, and who follows it
-finds out at which of them later scans fit as well (`lidar_motion`).
+A first and a second scan may fit each other at several speeds. Then the track forks, and later scans tell (`lidar_motion`).
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ _SAME_START = 0.005, 0.02  # rad and m between two expectations
 _SAME_POSE = 0.002, 0.005  # rad and m between what first passes have come to
 _FIRST_SPEEDS = 5.0, 10.0  # m/s, both ways along every axis
 _MOST_SEARCHES = 3  # failures after which no speed is tried any more: it is not the speed
-_SETTLES, _SETTLED_M_S = 4, 0.3  # rounds, and m/s between two of them
+_SETTLES, _SETTLED_M_S, _SAME_RATE = 4, 0.3, 0.05  # rounds; m/s and rad/s between two motions that are one
 _MOST_RIVALS, _RIVAL_COST = 3, 1.3  # and times the least cost
 _POOR = 1.5  # times the usual misfit: worth another guess
 _LONGEST_STEP_S = 1.0
@@ -121,7 +120,7 @@ class Track:
 
     @property
     def cost(self) -> float:
-        """What they have cost; to be compared over the same scans."""
+        """What they have cost."""
         return sum(pose.cost for pose in self._poses if pose.segment == self._segment)
 
     def add(self, scan: Scan, expected: Twist | None = None) -> list[Track]:
@@ -131,8 +130,7 @@ class Track:
             self._restart()
             return [self]
         self._lasted_s.append((scan.end_ns - scan.start_ns) * 1e-9)
-        scan = thinned(scan, MOST_RAW)
-        middle_ns = middle_of(scan)
+        scan, middle_ns = thinned(scan, MOST_RAW), middle_of(scan)
         if self._previous_ns is None:
             self._begin(scan, middle_ns)
             return [self]
@@ -179,16 +177,11 @@ class Track:
         The first was taken as it came. At 8 m/s it and the next are distorted alike, and fit each other where they are: where
         rest does not fit well, both are tried at speed.
         """
-        if self._velocity.any():
-            self._tree = self._map_of(first, self._rate, self._velocity)
-        found: list[tuple[_Fit, IkdTree]] = []
         best = self._best(scan, middle_ns, step_s, expected)
         if best is not None:
-            self._rate, self._velocity = best.rate, best.velocity
-            self._tree = self._map_of(first, self._rate, self._velocity)
+            self._tree, self._rate, self._velocity = self._map_of(first, best.rate, best.velocity), best.rate, best.velocity
             best = self._best(scan, middle_ns, step_s, expected)
-        if best is not None:
-            found.append((best, self._tree))
+        found = [] if best is None else [(best, self._tree)]
         if expected is not None or self._failed > _MOST_SEARCHES or (best is not None and best.misfit < GOOD_MISFIT_M):
             return found
         rate, tried = self._turning(middle_ns, step_s)[0], list[NDArray[np.float64]]()
@@ -196,8 +189,11 @@ class Track:
             fit = self._settled(first, scan, middle_ns, step_s, rate, velocity, tried)
             if fit is not None:
                 found.append((fit, self._tree))
-        found.sort(key=lambda one: one[0].cost)
-        return [one for one in found if one[0].cost < _RIVAL_COST * found[0][0].cost][: 1 + _MOST_RIVALS]
+        rivals: list[tuple[_Fit, IkdTree]] = []
+        for fit, tree in sorted(found, key=lambda one: one[0].cost):
+            if all(fit.cost < _RIVAL_COST * other.cost and not _same_motion(fit, other) for other, _ in rivals):
+                rivals.append((fit, tree))
+        return rivals[: 1 + _MOST_RIVALS]
 
     def _settled(
         self,
@@ -214,7 +210,7 @@ class Track:
         Args:
             tried: speeds at which others went on; those of this one are added, and it ends where it comes to one of them.
         """
-        fit: _Fit | None = None
+        fit = None
         for _ in range(_SETTLES):
             if any(np.abs(velocity - other).max() < _SETTLED_M_S for other in tried):
                 return None
@@ -223,10 +219,9 @@ class Track:
             fit = self._register(scan, middle_ns, step_s, rate, velocity)
             if fit is None:
                 return None
-            moved = np.abs(fit.velocity - velocity).max()
-            rate, velocity = fit.rate, fit.velocity
-            if moved < _SETTLED_M_S:
+            if np.abs(fit.velocity - velocity).max() < _SETTLED_M_S:
                 break
+            rate, velocity = fit.rate, fit.velocity
         return fit
 
     def _turning(self, middle_ns: int, step_s: float) -> list[NDArray[np.float64]]:
@@ -373,6 +368,12 @@ def _same_pose(x: NDArray[np.float64], y: NDArray[np.float64]) -> bool:
     """Whether two packed states (36,) are so near that the same comes of both."""
     turned = so3.log(x[R : R + 9].reshape(3, 3).T @ y[R : R + 9].reshape(3, 3))
     return bool(np.abs(turned).max() < _SAME_POSE[0] and np.abs(x[P : P + 3] - y[P : P + 3]).max() < _SAME_POSE[1])
+
+
+def _same_motion(fit: _Fit, other: _Fit) -> bool:
+    """Whether two fits of a scan say about the same."""
+    faster, turning = fit.velocity - other.velocity, fit.rate - other.rate
+    return bool(np.abs(faster).max() < _SETTLED_M_S and np.abs(turning).max() < _SAME_RATE)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -88,3 +89,16 @@ def test_a_path_begins_at_the_speed_of_its_first_scans(world: str, channels: int
     assert path.failed == 0 and len(path) == 6
     metres, radians = errors(path, simulation)  # of 7 m
     assert metres < 0.05 and radians < 0.005
+
+
+@pytest.mark.slow
+def test_tracks_that_lose_hold_together_leave_the_best_one() -> None:
+    """An empty scan ends them all before later scans have settled between them: the path goes on from what had fitted best."""
+    motion = manoeuvres.constant_velocity(1.3, (-5.6, 0.3, 1.6), (14.0, 0.0, 0.0), so3.exp(np.array([0.0, 0.0, 0.2])))
+    lidar = SpinningLidar(channels=32, azimuth_steps=900)
+    simulation = Simulation(Scenario("hall", worlds.hall(seed=23), motion, lidar, ImuModel(), np.eye(4)), 23, 0.7)
+    scans = data(simulation)[0]
+    nothing = replace(scans[4], p_lidar=scans[4].p_lidar[:0], time_ns=scans[4].time_ns[:0])
+    alone, broken = lidar_path(scans[:4], CONFIG), lidar_path([*scans[:4], nothing, scans[5]], CONFIG)
+    assert broken.failed == 1 and len(broken) == 5 and len(alone) == 4
+    assert np.array_equal(broken.p_path_lidar[:4], alone.p_path_lidar) and np.array_equal(broken.cost[:4], alone.cost)
