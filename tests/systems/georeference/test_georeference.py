@@ -104,6 +104,22 @@ def test_a_step_far_beyond_noise_is_a_jump_whatever_the_fit_with_two_datums_gate
     assert jumped.refusal is None and jumped.contradiction is not None and "fixes jump by " in jumped.contradiction
 
 
+@pytest.mark.parametrize("seed", [2, 4])
+def test_fixes_that_state_for_a_while_how_far_they_are_off_do_not_jump(seed: int) -> None:
+    """A receiver that loses its fixed solution for 40 s says 0.5 m, and is 0.5 m off: the map is right."""
+    given = drive(LAPS, seed, DriftConfig(speed=3.0))
+    fixes = given.fixes(RTK)
+    seconds = (fixes.time_ns - fixes.time_ns[0]) * 1e-9
+    lost = (seconds >= 0.4 * seconds[-1]) & (seconds < 0.4 * seconds[-1] + 40.0)
+    lat_lon_alt, covariance = fixes.lat_lon_alt.copy(), fixes.covariance.copy()
+    lat_lon_alt[lost, 0] += 0.5 / 111_320.0
+    covariance[lost] = 0.25 * np.eye(3)
+    vague = replace(fixes, lat_lon_alt=lat_lon_alt, covariance=covariance)
+    result = georeference(given.graph, vague, given.time_ns, given.T_odo_imu, None, np.array(LEVER))
+    assert result.refusal is None and result.contradiction is None and result.fit is not None
+    assert given.off(result).max() < 4.0 * np.sqrt(2.0) * result.fit.sigma.max()
+
+
 def test_a_jump_is_as_long_as_two_datums_are_apart(laps: Drive) -> None:
     """Of the map that lies between them the errors step by less."""
     between = found(laps, GOOD.model_copy(update={**PRECISE, "jump": (1.2, 0.9, 0.0)}))
