@@ -6,9 +6,8 @@ import math
 from pathlib import Path
 from typing import get_args
 
-import numpy as np
-
 from boxplus.runs.storage.row_log import Columns, RowLogWriter
+from boxplus.runs.vague_pose import largest_sigmas
 from boxplus.systems.localization.localizer import Localization, Search, Status
 
 LOG_COLUMNS = Columns(
@@ -47,7 +46,7 @@ class LocalizationLog(RowLogWriter):
         compared = [nan] * 4 if matched is None else [matched.share, matched.innovation, matched.limit, matched.measured]
         sigmas = [nan, nan]
         if found.covariance is not None:
-            sigmas = [math.sqrt(max(np.linalg.eigvalsh(found.covariance[k, k])[-1], 0.0)) for k in (slice(3, 6), slice(0, 3))]
+            sigmas = list(reversed(largest_sigmas(found.covariance)))
         self.append_row(found.time_ns, found.status, [*compared, *sigmas], [])
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,13 +89,14 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
     tried = {False: 0, True: 0}  # of steps that last, and of short ones: many of these must not hide one that lasts
     while left.any():
         largest = int(np.argmax(left))
-        is_short, at_end = not lasting[largest], 2 * int(at[largest]) > len(attached)
+        first = int(at[largest])
+        is_short, at_end = not lasting[largest], 2 * first > len(attached)
         left[max(largest - _WINDOW, 0) : largest + _WINDOW + 1] = 0.0
-        side = found.is_used[at[largest] :] if at_end else found.is_used[: at[largest]]
+        side = found.is_used[first:] if at_end else found.is_used[:first]
         if tried[is_short] == _TRIED or (is_short and (short is not None or float(side.mean()) < _SIDE_USED)):
             continue
         tried[is_short] += 1
-        after = np.arange(len(attached)) >= at[largest]
+        after = np.arange(len(attached)) >= first
         try:
             split = refit(after)
         except SingularProblemError:  # what two datums leave undetermined is none
@@ -102,14 +104,15 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
         share = float(_steps(split.errors)[largest] / steps[largest])
         gated, before = (int(np.count_nonzero(~own.is_used)) for own in (split, found))
         # Fixes that state more than most do, as receivers do that lose theirs for a while, are judged by that.
-        beside = max(sigma, found.noise_scale * _sigma_beside(attached, seconds, int(at[largest])))
-        step = _sharpest(seconds, attached, found, int(at[largest]), beside)
+        stated = max(float(np.median(side)) if len(side) else 0.0 for side in _beside(attached.sigma, seconds, first))
+        step = _sharpest(seconds, attached, found, first, max(sigma, found.noise_scale * stated))
         freed = before - gated
         is_explained = freed >= 0 if share < _GONE else share < _LESS and freed >= _WINDOW and gated < _FEWER * before
         # A burst at the step hides what another datum leaves of it.
         is_left = gated <= before and (step.is_beside or (share < _LESS and step.is_told))
-        is_left = is_left and _rests_on_both(found, seconds, int(at[largest]), step)
-        is_sure = not is_short and step.is_sure and _least_used(found, seconds, int(at[largest])) >= _SIDE_USED
+        is_based = _rests_on_both(found, seconds, first)
+        is_left = is_left and is_based and _is_within_reach(found, step)
+        is_sure = not is_short and step.is_sure and is_based
         metres, bend = float(np.linalg.norm(split.datum_step[:2])), _bend(found, split)
         # Fixes on both sides were gated against a map between the two: a burst gives none of the others back, and chance a
         # few.
@@ -117,35 +120,36 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
         is_seen = max(step.gain, step.burst_gain, step.beside) >= _SEEN
         if is_seen and (gives_back or (not step.is_burst and (is_explained or is_left or is_sure))):
             # Of the map that lies bent between both the errors step by less: it goes along.
-            told = metres if is_explained or gives_back else max(metres, step.alone) if is_left else step.alone
-            jump = Jump(float(seconds[at[largest]]), told, not is_short, bend)
+            told = step.alone
+            if is_explained or gives_back:
+                told = metres
+            elif is_left:
+                told = max(metres, step.alone)
+            jump = Jump(float(seconds[first]), told, not is_short, bend)
             if jump.lasts:
                 return jump
             short = jump
     return short
 
 
-def _sigma_beside(attached: AttachedFixes, seconds: Floats, at: int) -> float:
-    """What the fixes near to a step state, on the side on which it is more [m]."""
+def _beside(values: NDArray[Any], seconds: Floats, at: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Of the values (N,) of fixes those near to the step at a fix, before it and after it."""
     near = np.abs(seconds - seconds[at]) <= _LASTING
-    sides = attached.sigma[:at][near[:at]], attached.sigma[at:][near[at:]]
-    return max(float(np.median(side)) if len(side) else 0.0 for side in sides)
+    return values[:at][near[:at]], values[at:][near[at:]]
 
 
-def _rests_on_both(found: Fit, seconds: Floats, at: int, step: Step) -> bool:
-    """Whether a map may lie between two datums so far apart: fixes of either are used, and so within reach of it.
+def _rests_on_both(found: Fit, seconds: Floats, at: int) -> bool:
+    """Whether the map rests on the fixes on both sides of a step.
 
     One that rests on the fixes of one side lies in their datum; what is on the other is another question (`plateau`).
     """
+    return all(len(side) > 0 and float(side.mean()) >= _SIDE_USED for side in _beside(found.is_used, seconds, at))
+
+
+def _is_within_reach(found: Fit, step: Step) -> bool:
+    """Whether a map may lie between two datums so far apart: fixes of either are used, and so within reach of it."""
     reach = float(np.linalg.norm(found.errors[found.is_used, :2], axis=1).max(initial=0.0))
-    return _least_used(found, seconds, at) >= _SIDE_USED and step.alone <= 2.0 * reach
-
-
-def _least_used(found: Fit, seconds: Floats, at: int) -> float:
-    """Share of the fixes near to a step that are used, on the side on which it is less; none where there are none."""
-    near = np.abs(seconds - seconds[at]) <= _LASTING
-    sides = found.is_used[:at][near[:at]], found.is_used[at:][near[at:]]
-    return min(float(side.mean()) if len(side) else 0.0 for side in sides)
+    return step.alone <= 2.0 * reach
 
 
 def _bend(found: Fit, split: Fit) -> float:

@@ -20,7 +20,7 @@ from boxplus.systems.visual_inertial_odometry.estimate import Status
 from boxplus.systems.visual_inertial_odometry.observations import Fit
 
 _ENOUGH = 15  # landmarks that agree; fewer leave directions to the IMU
-_ANY = 6  # landmarks without which a frame counts as blind
+FEWEST_SEEN = 6  # landmarks without which a frame counts as blind
 _CORNERS_HOLD = 5.0  # times as long as the IMU alone
 _DISAGREE = 0.35  # share of a frame's landmarks that is more than outliers
 _UNKNOWN_M = 100.0  # standard deviation of a position that is none
@@ -77,13 +77,13 @@ class Health:
         """
         time_ns, reasons = tracks.time_ns, []
         agreed = fit.agreed + fit.lines.agreed
-        if agreed >= _ANY or rests:
+        if agreed >= FEWEST_SEEN or rests:
             self._seen_ns = time_ns
         blind_s = (time_ns - self._seen_ns) * 1e-9
         if agreed < _ENOUGH and not rests:
             reasons.append(f"{agreed} landmarks agree with the frame, of at least {_ENOUGH}{self._view(tracks)}")
         # Corners without a depth, as one camera has them before it moves, hold the attitude and bound what position does.
-        has_corners = agreed + fit.not_agreed < _ANY and len(tracks) >= _ENOUGH
+        has_corners = agreed + fit.not_agreed < FEWEST_SEEN and len(tracks) >= _ENOUGH
         is_lost = blind_s > self.config.max_blind * (_CORNERS_HOLD if has_corners else 1.0)
         if is_lost:
             reasons.append(
@@ -117,7 +117,7 @@ class Health:
     def _contradictions(self, tracks: Tracks, fit: Fit) -> list[str]:
         """What does not go together, in the mean over the last ten frames or so."""
         seen, new = fit.agreed + fit.not_agreed, 1.0 - _MEMORY
-        if seen >= _ANY:
+        if seen >= FEWEST_SEEN:
             self._disagreeing += new * (fit.not_agreed / seen - self._disagreeing)
             self._fit_ratio += new * (fit.reprojection_px / self.config.pixel_sigma - self._fit_ratio)
         self._imu_ratio += new * (fit.imu_ratio - self._imu_ratio)

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -99,14 +99,17 @@ def test_a_run_without_trouble_says_that_its_shutter_rolls(tmp_path: Path, rolli
     assert read_vio_summary(VioFolder(tmp_path / "out").summary).warnings == summary.warnings
 
 
+def knowing_little(push: Callable[..., list[VioEstimate]]) -> Callable[..., list[VioEstimate]]:
+    """The same estimates, a thousand times as uncertain."""
+    return lambda odometry, event: [replace(one, covariance=1e6 * one.covariance) for one in push(odometry, event)]
+
+
 def test_positions_of_which_a_run_knows_little_are_told(
     recorded: Path, finished: tuple[VioFolder, VioSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert not any("own covariance" in warning.text for warning in finished[1].warnings)
     for name in ("push_image", "push_imu"):
-        original = getattr(VisualInertialOdometry, name)
-        vague = lambda self, event, original=original: [replace(e, covariance=1e6 * e.covariance) for e in original(self, event)]  # noqa: E731
-        monkeypatch.setattr(VisualInertialOdometry, name, vague)
+        monkeypatch.setattr(VisualInertialOdometry, name, knowing_little(getattr(VisualInertialOdometry, name)))
     with open_camera_recording(recorded) as recording:
         summary = run_visual_odometry(recording, tmp_path / "out", CONFIG)
     (text,) = (warning.text for warning in summary.warnings if "own covariance" in warning.text)

@@ -47,27 +47,20 @@ def lidar_path(
     """
     tracks = [Track(config, guesses, undistort=undistort, velocity=velocity, held=held)]
     for number, scan in enumerate(scans):
-        best = _best(tracks)
         tracks = [one for track in tracks for one in track.add(scan, None if expected is None else expected[number])]
-        tracks = _worth_following(tracks, best)
+        tracks = _worth_following(tracks)
         if unbroken and tracks[0].failed:
             break
-    return _best(tracks).path()
+    return tracks[0].path()
 
 
-def _worth_following(tracks: Sequence[Track], best: Track) -> list[Track]:
-    """Of tracks through the same scans those that may be right: one, where later scans have told.
-
-    Args:
-        tracks: after a scan.
-        best: the one that had fitted best before it.
-    """
+def _worth_following(tracks: list[Track]) -> list[Track]:
+    """Of tracks through the same scans those that may be right, the best one first: one, where later scans have told."""
+    if len(tracks) == 1:
+        return tracks
     failed = min(track.failed for track in tracks)
     left = [track for track in tracks if track.failed == failed]
-    if left[0].length <= 1:  # they have lost hold together, and begin anew where the best one is
-        return [best if best in left else left[0]]
-    return left if left[0].length < _FOLLOWED else [_best(left)]
-
-
-def _best(tracks: Sequence[Track]) -> Track:
-    return min(tracks, key=lambda track: track.cost)
+    if left[0].length <= 1:  # they have lost hold together, and begin anew where the one is that was the best before
+        return left[:1]
+    left.sort(key=lambda track: track.cost)
+    return left if left[0].length < _FOLLOWED else left[:1]

@@ -184,7 +184,8 @@ class Track:
         found = [] if best is None else [(best, self._tree)]
         if expected is not None or self._failed > _MOST_SEARCHES or (best is not None and best.misfit < GOOD_MISFIT_M):
             return found
-        rate, tried = self._turning(middle_ns, step_s)[0], list[NDArray[np.float64]]()
+        rate = self._turning(middle_ns, step_s)[0]
+        tried: list[NDArray[np.float64]] = []
         for velocity in (speed * axis for speed in _FIRST_SPEEDS for axis in np.vstack([np.eye(3), -np.eye(3)])):
             fit = self._settled(first, scan, middle_ns, step_s, rate, velocity, tried)
             if fit is not None:
@@ -217,9 +218,7 @@ class Track:
             tried.append(velocity)
             self._tree = self._map_of(first, rate, velocity)
             fit = self._register(scan, middle_ns, step_s, rate, velocity)
-            if fit is None:
-                return None
-            if np.abs(fit.velocity - velocity).max() < _SETTLED_M_S:
+            if fit is None or np.abs(fit.velocity - velocity).max() < _SETTLED_M_S:
                 break
             rate, velocity = fit.rate, fit.velocity
         return fit

@@ -31,6 +31,7 @@ from boxplus.sensors.inertial.imu_noise import sample_noise
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.partners import swapped
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
+from boxplus.systems.visual_inertial_odometry.health import FEWEST_SEEN
 from boxplus.systems.visual_inertial_odometry.rig import Rig
 from boxplus.systems.visual_inertial_odometry.start.gyro_bias import estimate_gyro_bias, stereo_points
 from boxplus.systems.visual_inertial_odometry.start.linear_motion import solve_motion
@@ -44,7 +45,6 @@ _FEWEST_FRAMES, _MOST_FRAMES = 10, 16
 _FEWEST_TRACKS = 20
 _FEWEST_SAMPLES = 10
 _FEWEST_SIGHTINGS = 3  # of a track
-_FEWEST_AT_THE_END = 6  # of these tracks in the newest frame: with fewer it is blind, and nothing holds the pose from there on
 _CHI2, _BEHIND = 3.0, 10.0
 _BIAS_SIGMAS = 2.5
 _CAUTION = 2.0  # how many times as noisy as it was seen to be the IMU is taken for
@@ -174,9 +174,10 @@ def moving_start(seen: Sequence[Tracks], imu: ImuSamples, rig: Rig, config: VioC
     count = len(np.unique(tracks.track_of))
     if count < _FEWEST_TRACKS:
         return f"{count} corners were followed through {_FEWEST_SIGHTINGS} keyframes ({_FEWEST_TRACKS} are needed)"
+    # Of fewer the newest frame is blind, and nothing holds the pose from there on.
     at_the_end = len(np.unique(tracks.track_of[tracks.frame_of == len(frames) - 1]))
-    if at_the_end < _FEWEST_AT_THE_END:
-        return f"{at_the_end} of the {count} corners are in the newest frame ({_FEWEST_AT_THE_END} are needed): it is blind"
+    if at_the_end < FEWEST_SEEN:
+        return f"{at_the_end} of the {count} corners are in the newest frame ({FEWEST_SEEN} are needed): it is blind"
     exchange = swapped(frame.partners for frame in seen)
     if exchange is not None:
         return exchange

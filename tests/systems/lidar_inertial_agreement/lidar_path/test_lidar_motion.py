@@ -75,16 +75,20 @@ def test_what_is_held_along_the_way_is_registered_with_all_points(monkeypatch: p
     assert lidar_path(scans[:6], CONFIG, expected=true_twists(simulation, scans[:6]), held=True).failed == 0
 
 
+def at_14_m_s(world: str, lidar: SpinningLidar, seed: int) -> Simulation:
+    """0.7 s of a LiDAR that goes straight on at a steady speed."""
+    places = {"warehouse": sites.warehouse, "city": worlds.city, "hall": worlds.hall}
+    motion = manoeuvres.constant_velocity(1.3, (-5.6, 0.3, 1.6), (14.0, 0.0, 0.0), so3.exp(np.array([0.0, 0.0, 0.2])))
+    return Simulation(Scenario(world, places[world](seed=seed), motion, lidar, ImuModel(), np.eye(4)), seed, 0.7)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("world", "channels", "seed"),
     [("warehouse", 16, 22), ("warehouse", 32, 24), ("city", 64, 22), ("hall", 16, 24), ("hall", 32, 22), ("hall", 64, 24)],
 )
 def test_a_path_begins_at_the_speed_of_its_first_scans(world: str, channels: int, seed: int) -> None:
-    places = {"warehouse": sites.warehouse, "city": worlds.city, "hall": worlds.hall}
-    motion = manoeuvres.constant_velocity(1.3, (-5.6, 0.3, 1.6), (14.0, 0.0, 0.0), so3.exp(np.array([0.0, 0.0, 0.2])))
-    lidar = SpinningLidar(channels=channels, azimuth_steps=512)
-    simulation = Simulation(Scenario(world, places[world](seed=seed), motion, lidar, ImuModel(), np.eye(4)), seed, 0.7)
+    simulation = at_14_m_s(world, SpinningLidar(channels=channels, azimuth_steps=512), seed)
     path = lidar_path(data(simulation)[0], CONFIG)
     assert path.failed == 0 and len(path) == 6
     metres, radians = errors(path, simulation)  # of 7 m
@@ -94,10 +98,7 @@ def test_a_path_begins_at_the_speed_of_its_first_scans(world: str, channels: int
 @pytest.mark.slow
 def test_tracks_that_lose_hold_together_leave_the_best_one() -> None:
     """An empty scan ends them all before later scans have settled between them: the path goes on from what had fitted best."""
-    motion = manoeuvres.constant_velocity(1.3, (-5.6, 0.3, 1.6), (14.0, 0.0, 0.0), so3.exp(np.array([0.0, 0.0, 0.2])))
-    lidar = SpinningLidar(channels=32, azimuth_steps=900)
-    simulation = Simulation(Scenario("hall", worlds.hall(seed=23), motion, lidar, ImuModel(), np.eye(4)), 23, 0.7)
-    scans = data(simulation)[0]
+    scans = data(at_14_m_s("hall", SpinningLidar(channels=32, azimuth_steps=900), 23))[0]
     nothing = replace(scans[4], p_lidar=scans[4].p_lidar[:0], time_ns=scans[4].time_ns[:0])
     alone, broken = lidar_path(scans[:4], CONFIG), lidar_path([*scans[:4], nothing, scans[5]], CONFIG)
     assert broken.failed == 1 and len(broken) == 5 and len(alone) == 4
