@@ -163,7 +163,50 @@ def strong_step(A: NDArray[np.float64], b: NDArray[np.float64], directions: Pose
 
 def strong_covariance(A: NDArray[np.float64], directions: PoseDirections) -> NDArray[np.float64]:
     """(6, 6) covariance of the pose from A alone, zero along the weak directions."""
-    strong = directions.basis[:, ~directions.weak]
-    reduced = strong.T @ A[:6, :6] @ strong
-    covariance: NDArray[np.float64] = strong @ np.linalg.solve(reduced, strong.T)
+    covariance = np.zeros((6, 6))
+    if not _strong_covariance_into(np.ascontiguousarray(A[:6, :6]), directions.basis, directions.weak, covariance):
+        raise np.linalg.LinAlgError("the information is zero along a direction that is not weak")
     return covariance
+
+
+@kernel
+def _strong_covariance_into(
+    A: NDArray[np.float64], basis: NDArray[np.float64], weak: NDArray[np.bool_], covariance: NDArray[np.float64]
+) -> bool:
+    """V (Vᵀ A V)⁻¹ Vᵀ into zeros, all (6, 6), V the columns of `basis` that are not weak; False where there is no inverse."""
+    strong, V = 0, np.empty((6, 6))
+    for j in range(6):
+        if not weak[j]:
+            for i in range(6):
+                V[i, strong] = basis[i, j]
+            strong += 1
+    system, half = np.empty((6, 12)), np.empty(6)  # Vᵀ A V, and beside it Vᵀ, which elimination makes (Vᵀ A V)⁻¹ Vᵀ
+    for j in range(strong):
+        for i in range(6):
+            half[i] = 0.0
+            for k in range(6):
+                half[i] += A[i, k] * V[k, j]
+            system[j, 6 + i] = V[i, j]
+        for i in range(strong):
+            system[i, j] = 0.0
+            for k in range(6):
+                system[i, j] += V[k, i] * half[k]
+    for column in range(strong):
+        pivot = column
+        for row in range(column + 1, strong):
+            if abs(system[row, column]) > abs(system[pivot, column]):
+                pivot = row
+        if system[pivot, column] == 0.0:
+            return False
+        for k in range(12):
+            system[column, k], system[pivot, k] = system[pivot, k], system[column, k]
+        for row in range(strong):
+            if row != column:
+                factor = system[row, column] / system[column, column]
+                for k in range(column, 12):
+                    system[row, k] -= factor * system[column, k]
+    for i in range(6):
+        for j in range(6):
+            for k in range(strong):
+                covariance[i, j] += V[i, k] * system[k, 6 + j] / system[k, k]
+    return True

@@ -89,9 +89,10 @@ class Correction:
             moved: (3,) [m], along any axes.
             turned: (3,) rotation vector about the IMU's axes [rad].
         """
-        spread = math.sqrt(max(1.0 - float(self.facing @ self.facing), _LEAST_SPREAD**2))
-        aside = float(np.linalg.norm(np.cross(turned, self.facing))) / spread
-        return math.exp(-float(np.linalg.norm(moved)) / self.lever_arm - aside)
+        (fx, fy, fz), (tx, ty, tz) = self.facing.tolist(), turned.tolist()
+        spread = math.sqrt(max(1.0 - (fx * fx + fy * fy + fz * fz), _LEAST_SPREAD**2))
+        aside = math.hypot(ty * fz - tz * fy, tz * fx - tx * fz, tx * fy - ty * fx) / spread
+        return math.exp(-math.hypot(*moved.tolist()) / self.lever_arm - aside)
 
 
 class MapDatum:
@@ -151,10 +152,7 @@ class MapDatum:
         """The map has taken in so many points of the scan, so many of them in the place of others."""
         self._local_points += points - replaced
         self._new_share = points / self._local_points if points else 0.0
-        step = np.eye(12)
-        step[_MAP, _MAP] *= 1.0 - self._new_share
-        step[_MAP, _POSE] = self._new_share * np.eye(6)
-        self._joint = step @ self._joint @ step.T
+        _bring(self._new_share, self._joint)
 
     def creep(self, cov: NDArray[np.float64], x: NDArray[np.float64]) -> None:
         """Widen the filter's `cov` (n, n), in place, by how the last scan has moved the local map against the pose at x (36,).
@@ -239,6 +237,21 @@ def _follow(
     _turn_into(cov, rotation, before)
     for i in range(3):
         p_world_imu[i] = x[P + i]
+
+
+@kernel
+def _bring(share: float, joint: NDArray[np.float64]) -> None:
+    """The map errs by a share of the pose's error, and by the rest of its own: joint covariances (2, 12, 12), in place."""
+    kept = 1.0 - share
+    for k in range(joint.shape[0]):
+        for i in range(6):
+            for j in range(i + 1):
+                across = joint[k, i, 6 + j] + joint[k, j, 6 + i]
+                of_map = kept * kept * joint[k, 6 + i, 6 + j] + kept * share * across + share * share * joint[k, i, j]
+                joint[k, 6 + i, 6 + j] = joint[k, 6 + j, 6 + i] = of_map
+        for i in range(6):
+            for j in range(6):
+                joint[k, i, 6 + j] = joint[k, 6 + j, i] = kept * joint[k, i, 6 + j] + share * joint[k, i, j]
 
 
 @kernel

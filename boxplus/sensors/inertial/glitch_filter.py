@@ -30,20 +30,24 @@ class GlitchFilter:
 
     def take(self, samples: ImuSamples) -> ImuSamples:
         """What is known by now to be none."""
-        zero = empty(samples)
-        if zero.any():
+        if not samples.accel.any(axis=1).all():
+            zero = empty(samples)
             dropped = zero & (self._is_alive | np.logical_or.accumulate(~zero))
             self._reject(EMPTY, int(dropped.sum()))
             samples = samples.where(~dropped)
+            self._is_alive = self._is_alive or not bool(zero.all())
+        elif len(samples):
+            self._is_alive = True
         if not len(samples):
             return samples
-        self._is_alive = self._is_alive or not bool(zero.all())
         known = len(self._before) - int(self._waits)  # of them, what has been judged
         seen = ImuSamples.joined([self._before, samples])
         odd = glitches(seen)
+        self._before = seen.where(slice(-_CONTEXT, None))
+        if not (self._waits or odd.any()):  # as nearly always
+            return seen.where(slice(known, None))  # not the caller's memory, which he may use again
         self._waits = bool(odd[-1])
         odd[-1] = False
-        self._before = seen.where(slice(-_CONTEXT, None))
         keep = ~odd
         keep[:known] = False
         keep[len(seen) - int(self._waits) :] = False

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
 from boxplus.sensors.inertial.imu import ImuSamples
 
 # White noise of variance σ² makes second differences of variance (1 + 4 + 1) σ²; a body in motion, hardly any.
@@ -26,8 +29,17 @@ def sample_noise(imu: ImuSamples) -> NDArray[np.float64]:
     """
     steps = np.sort(np.diff(imu.time_ns))
     step_s = 0.5e-9 * float(steps[(len(steps) - 1) // 2] + steps[len(steps) // 2])  # their median
-    values = np.concatenate([imu.gyro, imu.accel], axis=1)
-    second = values[2:] - 2.0 * values[1:-1] + values[:-2]
-    squares = np.einsum("ij,ij->j", second, second).reshape(2, 3) / len(second)
-    noise: NDArray[np.float64] = np.sqrt(squares / _SECOND_DIFFERENCE * step_s)
+    noise = np.zeros((2, 3))
+    for sensor, values in enumerate((imu.gyro, imu.accel)):
+        _second_differences_into(values, step_s / (_SECOND_DIFFERENCE * (len(imu) - 2)), noise[sensor])
     return noise
+
+
+@kernel
+def _second_differences_into(values: NDArray[np.float64], scale: float, roots: NDArray[np.float64]) -> None:
+    """√(scale × the sum of squares) of the second differences of (n, 3), by axis, into zeros (3,)."""
+    for k in range(2, len(values)):
+        for axis in range(3):
+            roots[axis] += (values[k, axis] - 2.0 * values[k - 1, axis] + values[k - 2, axis]) ** 2
+    for axis in range(3):
+        roots[axis] = math.sqrt(scale * roots[axis])

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
 from boxplus.sensors.inertial.imu import ImuSamples
 
+_WAYS = 12  # along the six axes, and against them
 _MEMORY = 20  # blocks
 _BLOCK_NS = 100_000_000  # of samples that are looked at as a whole
 _LEAST_SPREAD = np.array([0.5, 0.5, 0.5, 1.5, 1.5, 1.5])  # rad/s, m/s²: at rest quantised values repeat as well
@@ -61,50 +62,93 @@ class Saturation:
     """
 
     def __init__(self) -> None:
-        ways = 12  # along the six axes, and against them
-        self._peak, self._step = np.zeros(ways), np.full(2, np.inf)  # of gyroscope and accelerometer
-        self._plateaus, self._run, self._cut_off = np.zeros(ways, np.int64), np.zeros(ways, np.int64), np.zeros(ways, np.bool_)
-        self._low: deque[NDArray[np.float64]] = deque(maxlen=_MEMORY)
-        self._limit = np.zeros(ways, np.bool_)  # reached within the present block
-        self._last: NDArray[np.float64] | None = None
-        self._last_ns = np.iinfo(np.int64).min
+        self._peak, self._step = np.zeros(_WAYS), np.full(2, np.inf)  # of gyroscope and accelerometer
+        self._plateaus, self._run = np.zeros(_WAYS, np.int64), np.zeros(_WAYS, np.int64)
+        self._cut_off, self._limit = np.zeros(_WAYS, np.bool_), np.zeros(_WAYS, np.bool_)  # reached within the present block
+        self._low, self._blocks = np.full((_MEMORY, 6), np.inf), 0
+        self._last, self._last_ns = np.full(6, np.nan), np.iinfo(np.int64).min
 
     def update(self, imu: ImuSamples) -> list[Limit]:
         """Take a block of samples in, those of one scan or image; returns the limits that they reach."""
-        new = imu.time_ns > self._last_ns  # blocks share the samples at their border
-        if not new.any():
+        if not len(imu) or imu.time_ns[-1] <= self._last_ns:
             return []
-        along = np.hstack([imu.gyro, imu.accel])[new]
-        self._low.append(np.abs(along).min(axis=0))
-        changes = np.abs(np.diff(np.vstack([along[0] if self._last is None else self._last, along]), axis=0))
-        self._last, self._last_ns = along[-1], int(imu.time_ns[-1])
-        values = np.hstack([along, -along])
-        highest = values.max(axis=0)
-        largest = np.maximum(highest, self._peak).reshape(2, 6).max(axis=0)
-        least = np.where(changes > _SAME * largest, changes, np.inf).min(axis=0)
-        self._step = np.minimum(self._step, least.reshape(2, 3).min(axis=1))
-        if (highest < self._peak * (1.0 - _SAME)).all():  # no axis is at its peak
-            self._run[:] = 0
+        first = int(np.searchsorted(imu.time_ns, self._last_ns, side="right"))  # blocks share the samples at their border
+        self._last_ns = int(imu.time_ns[-1])
+        low = self._low[self._blocks % _MEMORY]
+        self._blocks += 1
+        state = self._peak, self._step, self._plateaus, self._run, self._cut_off, self._limit
+        if not _follow(imu.gyro, imu.accel, first, self._last, low, *state):
             return []
-        self._limit[:] = False
-        cuts = np.tile(changes > _MOST_STEPS * np.repeat(self._step, 3), 2)
-        for value, is_cut in zip(values, cuts, strict=True):
-            self._follow(value, is_cut)
-        clipped = self._limit & (self._peak - np.tile(np.min(self._low, axis=0), 2) > np.tile(_LEAST_SPREAD, 2))
+        clipped = self._limit & (self._peak - np.tile(self._low.min(axis=0), 2) > np.tile(_LEAST_SPREAD, 2))
         return [Limit(way, float(self._peak[way])) for way in np.flatnonzero(clipped).tolist()]
 
-    def _follow(self, value: NDArray[np.float64], is_cut: NDArray[np.bool_]) -> None:
-        """Take one sample in (12,): its axes, and against them; `is_cut` where it changed by more than a step or two."""
-        higher = value > self._peak * (1.0 + _SAME)
-        self._plateaus[higher], self._run[higher], self._limit[higher], self._cut_off[higher] = 0, 0, False, False
-        at_peak = value >= self._peak * (1.0 - _SAME)
-        np.maximum(self._peak, value, out=self._peak)
-        begins = at_peak & (self._run == 0)
-        self._cut_off[begins] |= is_cut[begins]  # what cut one change off is a limit, however it is reached later
-        self._run = np.where(at_peak, self._run + 1, 0)
-        self._plateaus += self._cut_off & (self._run == _PLATEAU)
-        long_or_again = (self._plateaus >= _ENOUGH) | (self._run >= _LONG)
-        self._limit |= self._cut_off & long_or_again & (self._run >= _PLATEAU)
+
+@kernel(inline=True)
+def _along(gyro: NDArray[np.float64], accel: NDArray[np.float64], sample: int, axis: int) -> float:
+    return float(gyro[sample, axis] if axis < 3 else accel[sample, axis - 3])
+
+
+@kernel
+def _follow(
+    gyro: NDArray[np.float64],
+    accel: NDArray[np.float64],
+    first: int,
+    last: NDArray[np.float64],
+    low: NDArray[np.float64],
+    peak: NDArray[np.float64],
+    step: NDArray[np.float64],
+    plateaus: NDArray[np.int64],
+    run: NDArray[np.int64],
+    cut_off: NDArray[np.bool_],
+    limit: NDArray[np.bool_],
+) -> bool:
+    """Take the samples from `first` on in; False where no axis is at its peak, and no limit is reached.
+
+    Args:
+        last: (6,) the sample before, NaN where there is none; low: (6,) receives the least size of each axis.
+        peak, plateaus, run, cut_off, limit: (12,) along the axes of gyroscope and accelerometer, and against them; step: (2,).
+    """
+    highest, changed = np.full(_WAYS, -np.inf), last.copy()
+    low[:] = np.inf
+    for sample in range(first, len(gyro)):
+        for axis in range(6):
+            value = _along(gyro, accel, sample, axis)
+            low[axis] = min(low[axis], abs(value))
+            highest[axis], highest[axis + 6] = max(highest[axis], value), max(highest[axis + 6], -value)
+    at_a_peak = False
+    for axis in range(6):
+        largest = max(max(highest[axis], highest[axis + 6]), max(peak[axis], peak[axis + 6]))
+        for sample in range(first, len(gyro)):
+            value = _along(gyro, accel, sample, axis)
+            change = abs(value - changed[axis])
+            changed[axis] = value
+            if change > _SAME * largest:
+                step[axis // 3] = min(step[axis // 3], change)
+        for way in (axis, axis + 6):
+            at_a_peak |= highest[way] >= peak[way] * (1.0 - _SAME)
+    if not at_a_peak:
+        run[:] = 0
+        last[:] = changed
+        return False
+    limit[:] = False
+    for sample in range(first, len(gyro)):
+        for axis in range(6):
+            value = _along(gyro, accel, sample, axis)
+            is_cut = abs(value - last[axis]) > _MOST_STEPS * step[axis // 3]
+            last[axis] = value
+            for way in (axis, axis + 6):
+                size = value if way < 6 else -value
+                if size > peak[way] * (1.0 + _SAME):
+                    plateaus[way], run[way], limit[way], cut_off[way] = 0, 0, False, False
+                at_peak = size >= peak[way] * (1.0 - _SAME)
+                peak[way] = max(peak[way], size)
+                if at_peak and run[way] == 0:
+                    cut_off[way] |= is_cut  # what cut one change off is a limit, however it is reached later
+                run[way] = run[way] + 1 if at_peak else 0
+                plateaus[way] += cut_off[way] and run[way] == _PLATEAU
+                long_or_again = plateaus[way] >= _ENOUGH or run[way] >= _LONG
+                limit[way] |= cut_off[way] and long_or_again and run[way] >= _PLATEAU
+    return True
 
 
 def limits_of(imu: ImuSamples) -> list[Limit]:

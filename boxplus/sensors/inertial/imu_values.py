@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
 from boxplus.sensors.inertial.imu import ImuSamples
 
 NOT_FINITE, BEYOND = "IMU sample not finite", "IMU sample beyond any sensor"
@@ -51,7 +53,7 @@ def glitches(imu: ImuSamples) -> NDArray[np.bool_]:
     before are from one another; the first nine are not judged. Of the last one only the sample before is known.
     """
     mask = np.zeros(len(imu), dtype=bool)
-    if len(imu) < 2:
+    if len(imu) < 2 or not _any_far(imu.time_ns, imu.gyro, imu.accel):
         return mask
     last_is_far = False
     seconds = 1e-9 * np.diff(imu.time_ns)
@@ -69,3 +71,19 @@ def glitches(imu: ImuSamples) -> NDArray[np.bool_]:
                 mask[k + 1] |= across < 0.5 * min(steps[k], steps[k + 1])
     mask[-1] = last_is_far and not mask[-2]
     return mask
+
+
+@kernel
+def _any_far(time_ns: NDArray[np.int64], gyro: NDArray[np.float64], accel: NDArray[np.float64]) -> bool:
+    """Whether any sample is farther from the one before than a platform could turn or be pushed: nearly always none is."""
+    for k in range(1, len(time_ns)):
+        seconds = 1e-9 * (time_ns[k] - time_ns[k - 1])
+        turned = pushed = 0.0
+        for axis in range(3):
+            turned += (gyro[k, axis] - gyro[k - 1, axis]) ** 2
+            pushed += (accel[k, axis] - accel[k - 1, axis]) ** 2
+        if math.sqrt(turned) > max(_GLITCH_GYRO[1], _GLITCH_GYRO[0] * seconds):
+            return True
+        if math.sqrt(pushed) > max(_GLITCH_ACCEL[1], _GLITCH_ACCEL[0] * seconds):
+            return True
+    return False

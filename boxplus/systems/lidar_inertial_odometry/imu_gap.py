@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.nav_state import BW, P, R
-from boxplus.manifolds import so3
+from boxplus.filtering.nav_state import BW, TANGENT, boxminus_into
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 
@@ -22,8 +21,10 @@ def begins_blind(frame: Frame, max_gap_s: float) -> bool:
 
 def mean_motion(x_before: NDArray[np.float64], x: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
     """(2, 3) turn rate in the IMU frame [rad/s] and velocity in the world [m/s] that lead from one state (36,) to another."""
-    turned = so3.log(x_before[R : R + 9].reshape(3, 3).T @ x[R : R + 9].reshape(3, 3))
-    return np.stack([turned, x[P : P + 3] - x_before[P : P + 3]]) / seconds
+    moved = np.empty(TANGENT)
+    boxminus_into(x, x_before, moved)
+    rates: NDArray[np.float64] = moved[:6].reshape(2, 3) / seconds
+    return rates
 
 
 def with_turn_rate(frame: Frame, rate: NDArray[np.float64], x: NDArray[np.float64]) -> ImuSamples:

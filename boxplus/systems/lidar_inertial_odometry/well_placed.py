@@ -14,9 +14,12 @@ Derivation: docs/lidar_inertial_odometry.md, section 9.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
 from boxplus.filtering.nav_state import NavState
 
 NEAR_M = 3.0  # of where the odometry began
@@ -46,14 +49,24 @@ def well_placed(
         >>> well_placed(p_world, state, cov, np.zeros(3))
         array([[10.,  0.,  0.]])
     """
-    if float(np.linalg.norm(state.p_world_imu - p_began)) > NEAR_M:
+    if math.dist(state.p_world_imu.tolist(), p_began.tolist()) > NEAR_M:
         return p_world
+    placed = np.empty(len(p_world), np.bool_)
     turn = state.R_world_imu @ cov[:3, :3] @ state.R_world_imu.T
-    r = p_world - state.p_world_imu
-    squared = np.einsum("ni,ni->n", r, r)
-    total = float(np.trace(turn))
-    if total * float(squared.max(initial=0.0)) <= LARGEST_SIGMA_M**2:
-        return p_world
-    variance = total * squared - np.einsum("ni,ni->n", r @ turn, r)  # of θ × r, over all three axes
-    placed: NDArray[np.float64] = p_world[variance <= LARGEST_SIGMA_M**2]
-    return placed
+    count = _are_placed(np.ascontiguousarray(p_world), state.p_world_imu, turn, placed)
+    return p_world if count == len(p_world) else p_world[placed]
+
+
+@kernel
+def _are_placed(
+    p_world: NDArray[np.float64], center: NDArray[np.float64], turn: NDArray[np.float64], placed: NDArray[np.bool_]
+) -> int:
+    """Which points (m, 3) a rotation about `center` of covariance `turn` (3, 3) moves by so little; how many."""
+    total, count = turn[0, 0] + turn[1, 1] + turn[2, 2], 0
+    for n in range(len(p_world)):
+        x, y, z = p_world[n, 0] - center[0], p_world[n, 1] - center[1], p_world[n, 2] - center[2]
+        along = turn[0, 0] * x * x + turn[1, 1] * y * y + turn[2, 2] * z * z
+        along += 2.0 * (turn[0, 1] * x * y + turn[0, 2] * x * z + turn[1, 2] * y * z)
+        placed[n] = total * (x * x + y * y + z * z) - along <= LARGEST_SIGMA_M**2  # of θ × r, over all three axes
+        count += placed[n]
+    return count

@@ -8,20 +8,22 @@ without the filter (`lidar_inertial_agreement.watch`); a contradiction that last
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.nav_state import BA, BW, T_BA, T_BW, T_THETA_L, TANGENT, R, V, boxminus_into
-from boxplus.manifolds import so3
+from boxplus._jit import kernel
+from boxplus.filtering.nav_state import BA, BW, PL, RL, T_BA, T_BW, T_THETA_L, TANGENT, P, R, V, boxminus_into
+from boxplus.manifolds.so3 import log_into
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import Twist
 from boxplus.systems.lidar_inertial_agreement.shown import Shown
 from boxplus.systems.lidar_inertial_agreement.watch import Watch
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.mounted_update import MountedUpdate
-from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import T_imu_lidar_of, T_world_imu_of
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import T_imu_lidar_of
 from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem
 from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
 from boxplus.systems.lidar_inertial_odometry.watches.steady_bias import SteadyBias
@@ -176,18 +178,15 @@ class Consistency:
         """
         posterior, cov_prior = update.posterior, update.cov_prior
         x, directions = posterior.x, posterior.last.directions
-        speed = float(np.linalg.norm(x[V : V + 3]))
+        speed = math.hypot(*x[V : V + 3].tolist())
         if speed > _FASTEST_M_S:
             self._innovation_text = f"the estimate moves at {speed:.0f} m/s, which no platform with a LiDAR does"
             return [self._innovation_text] if self._once("speed") else []
         if not posterior.valid or directions.weak.all():
             self._contradicted, self._doubted = _Streak(), _Streak()
             return []
-        scale = np.array([directions.lever_arm] * 3 + [1.0] * 3)
-        strong = directions.vectors[:, ~directions.weak].T * scale
-        off = strong @ (correction[:6] - update.B_prior[:6] @ correction[T_THETA_L:TANGENT])
-        variance = np.einsum("ij,jk,ik->i", strong, cov_prior[:6, :6], strong) + (strong**2) @ _MEASUREMENT_SIGMA**2
-        now = float(np.max(off**2 / variance))
+        off = correction[:6] - update.B_prior[:6] @ correction[T_THETA_L:TANGENT]
+        now = _largest_innovation(directions.vectors, directions.weak, directions.lever_arm, off, cov_prior)
         self._innovation = _INNOVATION_KEEP * self._innovation + (1.0 - _INNOVATION_KEEP) * min(now, _ONE_SCAN)
         end_ns = frame.scan.end_ns
         doubted = self._innovation > _DOUBTED_INNOVATION and len(frame.imu) >= _FEWEST_SAMPLES
@@ -248,9 +247,10 @@ class Consistency:
         # Between few samples the turn is anybody's guess, and a bias takes it up.
         if not posterior.valid or len(frame.imu) < _FEWEST_SAMPLES:
             return []
-        whole, known = (np.diagonal(P)[T_BW : T_BW + 3] for P in (posterior.cov, update.cov))
+        whole, known = (P.diagonal()[T_BW : T_BW + 3] for P in (posterior.cov, update.cov))
         bias, by_mounting = posterior.x[BW : BW + 3], np.maximum(whole - known, 0.0)
-        rate = float(np.linalg.norm(frame.imu.gyro - bias, axis=1).mean())
+        turns = frame.imu.gyro - bias
+        rate = float(np.sqrt(np.einsum("ni,ni->n", turns, turns)).mean())
         return self._contradicting("steady", self._steady.update(frame.scan.end_ns, bias, known, by_mounting, rate))
 
     def _pushes(self, frame: Frame, correction: NDArray[np.float64], update: MountedUpdate) -> list[str]:
@@ -259,7 +259,7 @@ class Consistency:
         sought = not self._mounting_given and not self.mounting_borne_out
         gap = frame.largest_gap_s > self._max_imu_gap or len(frame.imu) < _FEWEST_SAMPLES
         if self._corrected_from_ns is None:  # a map as thick as a scan, metres from the next one, pulls fast ones back and forth
-            fast = float(np.linalg.norm(update.posterior.x[V : V + 3])) > _FAST_M_S
+            fast = math.hypot(*update.posterior.x[V : V + 3].tolist()) > _FAST_M_S
             self._corrected_from_ns = frame.scan.end_ns + (_THIN_MAP_NS if fast else 0)
         thin = frame.scan.end_ns < self._corrected_from_ns
         # Of a scan off the map nothing is taken up, and the next one wants the same again.
@@ -292,8 +292,10 @@ class Consistency:
 
 def _surely_above(bias: NDArray[np.float64], P: NDArray[np.float64], most: float) -> bool:
     """Whether a bias (3,) of covariance (3, 3) is longer than `most` by three standard deviations along it."""
-    size = float(np.linalg.norm(bias))
-    axis = bias / max(size, 1e-12)
+    size = math.hypot(*bias.tolist())
+    if size <= most:
+        return False
+    axis = bias / size
     return size - 3.0 * float(np.sqrt(axis @ P @ axis)) > most
 
 
@@ -302,9 +304,32 @@ def _lidar_twist(x_before: NDArray[np.float64], x: NDArray[np.float64], seconds:
 
     Each has its own mounting: where a scan moves that, it moves the IMU's pose the other way.
     """
-    before, now = (T_world_imu_of(state) @ T_imu_lidar_of(state) for state in (x_before, x))
-    R_now = now[:3, :3]
-    return so3.log(before[:3, :3].T @ R_now) / seconds, R_now.T @ (now[:3, 3] - before[:3, 3]) / seconds
+    R_before, R_now = (state[R : R + 9].reshape(3, 3) @ state[RL : RL + 9].reshape(3, 3) for state in (x_before, x))
+    p_before, p_now = (state[R : R + 9].reshape(3, 3) @ state[PL : PL + 3] + state[P : P + 3] for state in (x_before, x))
+    turned = np.empty(3)
+    log_into(R_before.T @ R_now, turned)
+    return turned / seconds, R_now.T @ (p_now - p_before) / seconds
+
+
+@kernel
+def _largest_innovation(
+    vectors: NDArray[np.float64], weak: NDArray[np.bool_], lever_arm: float, off: NDArray[np.float64], cov: NDArray[np.float64]
+) -> float:
+    """Over the directions (columns of (6, 6)) that are not weak, the largest square of `off` (6,), by the variance there."""
+    largest, along = 0.0, np.empty(6)
+    for direction in range(6):
+        if weak[direction]:
+            continue
+        moved = variance = 0.0
+        for i in range(6):
+            along[i] = vectors[i, direction] * (lever_arm if i < 3 else 1.0)
+            moved += along[i] * off[i]
+            variance += (along[i] * _MEASUREMENT_SIGMA[i]) ** 2
+        for i in range(6):
+            for j in range(6):
+                variance += along[i] * cov[i, j] * along[j]
+        largest = max(largest, moved * moved / variance)
+    return largest
 
 
 def _turn(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -11,12 +11,14 @@ what the corrections take off it adds up to D δ, D = Σ (B⁻ − B⁺), which 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus._jit import kernel
 from boxplus.filtering.nav_state import T_V
 from boxplus.filtering.small_linalg import symmetric_eigen_into
 from boxplus.systems.lidar_inertial_odometry.mounted_update import MountedUpdate
@@ -77,13 +79,28 @@ class Corrections:
 
     def _over(self, now: float, window: float) -> tuple[float, float, float]:
         """The sum of the last seconds: by how many standard deviations it is off, over which time [s], and its length [m/s]."""
-        kept = [sums for sums in self._before if now - sums.at_s > window - _SLACK_S]
-        if not kept:
+        begin = next((sums for sums in reversed(self._before) if now - sums.at_s > window - _SLACK_S), None)
+        if begin is None:
             return 0.0, 0.0, 0.0
-        begin = kept[-1]
-        moved = self._moved - begin.moved
-        values, axes = np.empty(3), np.empty((3, 3))
-        symmetric_eigen_into(self._covariance - begin.covariance + moved @ begin.mounting @ moved.T, values, axes)
         total = self._sum - begin.corrections
-        squared = (axes.T @ total) ** 2 / (np.maximum(values, 0.0) + _FLOOR**2)
-        return float(np.sqrt(squared.sum())), now - begin.at_s, float(np.linalg.norm(total))
+        sigmas = _deviations(total, self._covariance - begin.covariance, self._moved - begin.moved, begin.mounting)
+        return sigmas, now - begin.at_s, math.hypot(*total.tolist())
+
+
+@kernel
+def _deviations(
+    total: NDArray[np.float64], covariance: NDArray[np.float64], moved: NDArray[np.float64], mounting: NDArray[np.float64]
+) -> float:
+    """√(sᵀ C⁻¹ s) of a sum s (3,), C = `covariance` (3, 3) + D Σ_T Dᵀ with D (3, 6) and Σ_T (6, 6), and the floor."""
+    C, values, axes = covariance.copy(), np.empty(3), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(6):
+                for m in range(6):
+                    C[i, j] += moved[i, k] * mounting[k, m] * moved[j, m]
+    symmetric_eigen_into(C, values, axes)
+    squared = 0.0
+    for axis in range(3):
+        along = axes[0, axis] * total[0] + axes[1, axis] * total[1] + axes[2, axis] * total[2]
+        squared += along * along / (max(values[axis], 0.0) + _FLOOR**2)
+    return math.sqrt(squared)

@@ -14,8 +14,12 @@ filter here knows of it: what it comes to at the present rate is allowed for.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
+
+from boxplus._jit import kernel
 
 _APART_S = 0.5  # between estimates that are kept, at first
 _MOST = 64  # of them; then every other one goes
@@ -53,23 +57,18 @@ class SteadyBias:
             rate: at which the platform turned within the scan [rad/s].
         """
         now = time_ns * 1e-9
-        faded = np.exp(-max(now - self._rate_s, 0.0) / _MEMORY_S)
+        faded = math.exp(-max(now - self._rate_s, 0.0) / _MEMORY_S)
         self._rate, self._rate_s = faded * self._rate + (1.0 - faded) * rate, now
         by_mounting = by_mounting + (_SCALE * self._rate) ** 2
-        since = (now - self._time_s)[:, None]
-        bias_before, variance_before, by_mounting_before = self._kept.swapaxes(0, 1)
-        moved = np.abs(bias - bias_before)
-        learnt = np.maximum(variance_before * (1.0 + _ROUGHLY**2) - variance, 0.0)
-        allowed = np.sqrt(learnt + self._walk**2 * since + by_mounting_before + by_mounting)
-        off = np.where(moved > _LEAST, moved / np.maximum(allowed, 1e-12), 0.0)
-        if not len(off) or now - self._time_s[-1] >= self._apart_s:
+        row, axis, moved, sigmas = _moved_most(self._time_s, self._kept, now, bias, variance, by_mounting, self._walk)
+        since = now - self._time_s[row] if len(self._time_s) else 0.0
+        if not len(self._time_s) or now - self._time_s[-1] >= self._apart_s:
             self._keep(now, np.stack([bias, variance, by_mounting]))
-        if off.max(initial=0.0) < _SIGMAS:
+        if sigmas < _SIGMAS:
             return None
-        row, axis = np.unravel_index(np.argmax(off), off.shape)
         return (
-            f"the gyroscope's bias about {'xyz'[axis]} has moved by {np.degrees(moved[row, axis]):.2f} deg/s within "
-            f"{since[row, 0]:.1f} s, by {off[row, axis]:.0f} standard deviations of what was known of it: the estimate was surer "
+            f"the gyroscope's bias about {'xyz'[axis]} has moved by {np.degrees(moved):.2f} deg/s within "
+            f"{since:.1f} s, by {sigmas:.0f} standard deviations of what was known of it: the estimate was surer "
             "than right, at its start above all; poses may be off, and the map tilted, by far more than their covariance says"
         )
 
@@ -78,3 +77,28 @@ class SteadyBias:
             self._time_s, self._kept = self._time_s[::2], self._kept[::2]
             self._apart_s *= 2.0
         self._time_s, self._kept = np.append(self._time_s, now), np.concatenate([self._kept, estimate[None]])
+
+
+@kernel
+def _moved_most(
+    time_s: NDArray[np.float64],
+    kept: NDArray[np.float64],
+    now: float,
+    bias: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    by_mounting: NDArray[np.float64],
+    walk: float,
+) -> tuple[int, int, float, float]:
+    """Which of the estimates kept (n, 3, 3) the bias has left farthest, about which axis, by how much, and in deviations."""
+    row, about, by, largest = 0, 0, 0.0, 0.0
+    for k in range(len(time_s)):
+        for axis in range(3):
+            moved = abs(bias[axis] - kept[k, 0, axis])
+            if moved <= _LEAST:
+                continue
+            learnt = max(kept[k, 1, axis] * (1.0 + _ROUGHLY**2) - variance[axis], 0.0)
+            allowed = math.sqrt(learnt + walk**2 * (now - time_s[k]) + kept[k, 2, axis] + by_mounting[axis])
+            sigmas = moved / max(allowed, 1e-12)
+            if sigmas > largest:
+                row, about, by, largest = k, axis, moved, sigmas
+    return row, about, by, largest

@@ -41,15 +41,21 @@ class StuckSensor:
             turned: (3,) rotation of the IMU over it, as the scan shows it [rad].
             bias: (3,) of the gyroscope, as it was known before the scan [rad/s].
         """
-        new = imu.time_ns > (self._time_ns[-1] if len(self._time_ns) else np.iinfo(np.int64).min)  # scans share some
-        if not new.any():
+        newest = int(self._time_ns[-1]) if len(self._time_ns) else np.iinfo(np.int64).min
+        known = int(np.searchsorted(imu.time_ns, newest, side="right"))  # scans share some
+        new = len(imu) - known
+        if not new:
             return None
-        time_ns = np.concatenate([self._time_ns, imu.time_ns[new]])
-        values = np.concatenate([self._values, np.hstack([imu.gyro, imu.accel])[new]])
+        time_ns = np.concatenate([self._time_ns, imu.time_ns[known:]])
+        values = np.concatenate([self._values, np.concatenate([imu.gyro[known:], imu.accel[known:]], axis=1)])
         # As long as what begins within this scan takes to show, and what was before it.
         enough_ns = round(_STUCK_S * 1e9) + time_ns[-1] - imu.time_ns[0]
-        first = min(int(np.searchsorted(time_ns, time_ns[-1] - enough_ns)), len(time_ns) - _FEWEST - int(new.sum())) - _BEFORE
+        first = min(int(np.searchsorted(time_ns, time_ns[-1] - enough_ns)), len(time_ns) - _FEWEST - new) - _BEFORE
         self._time_ns, self._values = time_ns[max(first, 0) :], values[max(first, 0) :]
+        repeats = (values[-1] == values[-2]).tolist() if len(values) > 1 else []
+        if not (all(repeats[_GYRO]) or all(repeats[_ACCEL])):
+            self._turns.clear()
+            return None  # as nearly always
         if self._stopped():
             return self._sentence("gyroscope", "and went there from a turn within one of them")
         if self._turns_alone(imu, turned, bias):
