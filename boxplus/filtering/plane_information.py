@@ -5,13 +5,12 @@ Derivation: docs/lidar_inertial_odometry.md, sections 5 and 6.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
+from boxplus.filtering.triples import Triple, cross, dot, placed, rotation_of, triple_of, turned_back
 
 # What became of a point.
 USED, FEW_NEIGHBOURS, NOT_A_PLANE, GATED, ONE_LINE, UNCONFIRMED = 0, 1, 2, 3, 4, 5
@@ -26,69 +25,51 @@ _SURE_TILT = 0.1**2
 MISFITS = 1.2
 
 
-@kernel(inline=True)
-def pose_row(
-    x: NDArray[np.float64],
-    lidar: tuple[float, float, float],
-    imu: tuple[float, float, float],
-    u: tuple[float, float, float],
-    with_extrinsic: bool,
-    h: NDArray[np.float64],
-) -> None:
-    """h = [s × C, u, ℓ × R_LᵀC, C] with C = Rᵀu: how uᵀ y moves with the state (docs/lidar_inertial_odometry.md, section 6)."""
-    lx, ly, lz = lidar
-    sx, sy, sz = imu
-    ux, uy, uz = u
-    cx = x[R] * ux + x[R + 3] * uy + x[R + 6] * uz
-    cy = x[R + 1] * ux + x[R + 4] * uy + x[R + 7] * uz
-    cz = x[R + 2] * ux + x[R + 5] * uy + x[R + 8] * uz
-    h[0], h[1], h[2] = sy * cz - sz * cy, sz * cx - sx * cz, sx * cy - sy * cx
-    h[3], h[4], h[5] = ux, uy, uz
-    if with_extrinsic:
-        ex = x[RL] * cx + x[RL + 3] * cy + x[RL + 6] * cz
-        ey = x[RL + 1] * cx + x[RL + 4] * cy + x[RL + 7] * cz
-        ez = x[RL + 2] * cx + x[RL + 5] * cy + x[RL + 8] * cz
-        h[6], h[7], h[8] = ly * ez - lz * ey, lz * ex - lx * ez, lx * ey - ly * ex
-        h[9], h[10], h[11] = cx, cy, cz
+@kernel(inline=True, fastmath=True)
+def _add_square(sums: NDArray[np.float64], w: float, a: Triple, c: Triple, z: float) -> None:
+    """Add w h [h, z], h = [a, c], row by row from the diagonal on: 27 numbers, each with a place that is known when compiled."""
+    a0, a1, a2, c0, c1, c2 = a[0], a[1], a[2], c[0], c[1], c[2]
+    w0, w1, w2, w3, w4, w5 = w * a0, w * a1, w * a2, w * c0, w * c1, w * c2
+    sums[0] += w0 * a0
+    sums[1] += w0 * a1
+    sums[2] += w0 * a2
+    sums[3] += w0 * c0
+    sums[4] += w0 * c1
+    sums[5] += w0 * c2
+    sums[6] += w0 * z
+    sums[7] += w1 * a1
+    sums[8] += w1 * a2
+    sums[9] += w1 * c0
+    sums[10] += w1 * c1
+    sums[11] += w1 * c2
+    sums[12] += w1 * z
+    sums[13] += w2 * a2
+    sums[14] += w2 * c0
+    sums[15] += w2 * c1
+    sums[16] += w2 * c2
+    sums[17] += w2 * z
+    sums[18] += w3 * c0
+    sums[19] += w3 * c1
+    sums[20] += w3 * c2
+    sums[21] += w3 * z
+    sums[22] += w4 * c1
+    sums[23] += w4 * c2
+    sums[24] += w4 * z
+    sums[25] += w5 * c2
+    sums[26] += w5 * z
 
 
-@kernel(inline=True)
-def _add_noise(
-    x: NDArray[np.float64],
-    lidar: tuple[float, float, float],
-    imu: tuple[float, float, float],
-    plane: NDArray[np.float64],
-    beside: tuple[float, float],
-    weight: float,
-    with_extrinsic: bool,
-    row: NDArray[np.float64],
-    pull: NDArray[np.float64],
-    noise: NDArray[np.float64],
-) -> None:
-    """pull += w M Cov(u) (y − q) of one plane, noise += w M Cov(u) Mᵀ, with h = M u (`pose_row`).
-
-    Cov(u) = m² (g₁g₁ᵀ + g₂g₂ᵀ) with the variance m² that counts for the normal (column 13 of the record): as large as the noise
-    really is, whatever the settings say. It is linear in the noise; a unit vector cannot tilt further than by a radian.
-
-    Args:
-        beside: gᵢᵀ (y − q), where the point lies beside the middle of the plane's own points.
-    """
-    size = MEASURED_DOF if with_extrinsic else 6
-    for k in range(2):
-        first = 5 + 4 * k
-        gx, gy, gz = plane[first], plane[first + 1], plane[first + 2]
-        factor = weight * plane[13] / (1.0 + plane[13] * (gx * gx + gy * gy + gz * gz))
-        pose_row(x, lidar, imu, (gx, gy, gz), with_extrinsic, row)
-        pulled = factor * beside[k]
-        for i in range(size):
-            pull[i] += pulled * row[i]
-        for i in range(6):
-            wh = factor * row[i]
-            for j in range(i, 6):
-                noise[i, j] += wh * row[j]
+@kernel(inline=True, fastmath=True)
+def _add_product(sums: NDArray[np.float64], w: float, left: Triple, right: Triple) -> None:
+    """`sums` (9,), row by row, += w left rightᵀ."""
+    for i in range(3):
+        weighted = w * left[i]
+        sums[3 * i] += weighted * right[0]
+        sums[3 * i + 1] += weighted * right[1]
+        sums[3 * i + 2] += weighted * right[2]
 
 
-@kernel
+@kernel(fastmath=True)
 def accumulate_planes(
     x: NDArray[np.float64],
     p_lidar: NDArray[np.float32],
@@ -121,49 +102,82 @@ def accumulate_planes(
         noise: (6, 6), added to: what Cov(u) of these planes alone would give of A about the pose.
         sums: (2,) += [used points, Σ z²].
     """
-    h = np.empty(MEASURED_DOF)
-    row = np.empty(MEASURED_DOF)
-    size = MEASURED_DOF if with_extrinsic else 6
+    # As far as a compiler knows, what is stored may be what is loaded: the state is read once, the sums are written at the end.
+    rotation, mounting, place, lever = rotation_of(x, R), rotation_of(x, RL), triple_of(x, P), triple_of(x, PL)
+    of_pose, of_noise, of_mounting, crossed, pulled = np.zeros(27), np.zeros(27), np.zeros(27), np.zeros((4, 9)), np.zeros(6)
+    used, squares = 0.0, 0.0
     for n in range(p_lidar.shape[0]):
         if fate[n] != USED and fate[n] != GATED:
             continue
         plane = planes[n]
-        lx, ly, lz = np.float64(p_lidar[n, 0]), np.float64(p_lidar[n, 1]), np.float64(p_lidar[n, 2])
-        sx = x[RL] * lx + x[RL + 1] * ly + x[RL + 2] * lz + x[PL]
-        sy = x[RL + 3] * lx + x[RL + 4] * ly + x[RL + 5] * lz + x[PL + 1]
-        sz = x[RL + 6] * lx + x[RL + 7] * ly + x[RL + 8] * lz + x[PL + 2]
-        yx = x[R] * sx + x[R + 1] * sy + x[R + 2] * sz + x[P]
-        yy = x[R + 3] * sx + x[R + 4] * sy + x[R + 5] * sz + x[P + 1]
-        yz = x[R + 6] * sx + x[R + 7] * sy + x[R + 8] * sz + x[P + 2]
-        z = plane[0] * yx + plane[1] * yy + plane[2] * yz - plane[3]
-        if not 81.0 * z * z < math.sqrt(lx * lx + ly * ly + lz * lz):
+        u, g, k, p = triple_of(plane, 0), triple_of(plane, 5), triple_of(plane, 9), triple_of(p_lidar[n], 0)
+        s = placed(mounting, lever, p)
+        y = placed(rotation, place, s)
+        z = dot(u, y) - plane[3]
+        if not (81.0 * z * z) ** 2 < dot(p, p):
             fate[n] = GATED
             continue
         fate[n] = USED
-        t0 = plane[5] * yx + plane[6] * yy + plane[7] * yz - plane[8]
-        t1 = plane[9] * yx + plane[10] * yy + plane[11] * yz - plane[12]
+        t0, t1 = dot(g, y) - plane[8], dot(k, y) - plane[12]
         # The misfit of the plane's own points says how far to trust it; the Cauchy weight, how far to trust the point.
         spread_sq = t0 * t0 + t1 * t1
         variance = range_variance + 0.2 * map_variance + _TILT_VARIANCE * spread_sq + plane[4] * (MISFITS + spread_sq)
-        weight = 1.0 / (variance + z * z)
-        tilt = 0.0
-        for first in (5, 9):
-            tilt += plane[first] * plane[first] + plane[first + 1] * plane[first + 1] + plane[first + 2] * plane[first + 2]
-        weight /= 1.0 + plane[13] * tilt / _SURE_TILT
+        gg, kk = dot(g, g), dot(k, k)
+        weight = 1.0 / ((variance + z * z) * (1.0 + plane[13] * (gg + kk) / _SURE_TILT))
         plane[14] = weight
-        pose_row(x, (lx, ly, lz), (sx, sy, sz), (plane[0], plane[1], plane[2]), with_extrinsic, h)
-        for i in range(size):
-            wh = weight * h[i]
-            b[i] += wh * z
-            for j in range(i, size):
-                A[i, j] += wh * h[j]
+        C = turned_back(rotation, u)
+        turn = cross(s, C)
+        _add_square(of_pose, weight, turn, u, z)
+        if with_extrinsic:
+            turn_on_it = cross(p, turned_back(mounting, C))
+            _add_square(of_mounting, weight, turn_on_it, C, z)
+            _add_product(crossed[0], weight, turn, turn_on_it)
+            _add_product(crossed[1], weight, turn, C)
+            _add_product(crossed[2], weight, u, turn_on_it)
+            _add_product(crossed[3], weight, u, C)
         if with_criterion:
-            _add_noise(x, (lx, ly, lz), (sx, sy, sz), plane, (t0, t1), weight, with_extrinsic, row, pull, noise)
-        sums[0] += 1.0
-        sums[1] += z * z
+            # Cov(u) = m² (gᵢgᵢᵀ) with the variance m² that counts for the normal (column 13 of the record): as large as the noise
+            # really is, whatever the settings say. It is linear in the noise; a unit vector cannot tilt further than by a radian.
+            for v, vv, beside in ((g, gg, t0), (k, kk, t1)):
+                factor = weight * plane[13] / (1.0 + plane[13] * vv)
+                C = turned_back(rotation, v)
+                turn = cross(s, C)
+                _add_square(of_noise, factor, turn, v, beside)
+                if with_extrinsic:
+                    turn_on_it = cross(p, turned_back(mounting, C))
+                    for i in range(3):
+                        pulled[i] += factor * beside * turn_on_it[i]
+                        pulled[3 + i] += factor * beside * C[i]
+        used += 1.0
+        squares += z * z
+    sums[0] += used
+    sums[1] += squares
+    _unpack(of_pose, A[:6, :6], b[:6])
+    if with_extrinsic:
+        _unpack(of_mounting, A[6:, 6:], b[6:])
+        for i in range(3):
+            for j in range(3):
+                for block in range(4):
+                    A[3 * (block // 2) + i, 6 + 3 * (block % 2) + j] += crossed[block, 3 * i + j]
+    if with_criterion:
+        _unpack(of_noise, noise, pull[:6])
+        for i in range(6):
+            pull[6 + i] += pulled[i]
     _mirror(A)
     if with_criterion:
         _mirror(noise)
+
+
+@kernel
+def _unpack(sums: NDArray[np.float64], square: NDArray[np.float64], vector: NDArray[np.float64]) -> None:
+    """What `_add_square` has added up, to the upper triangle of `square` (6, 6) and to `vector` (6,)."""
+    k = 0
+    for i in range(6):
+        for j in range(i, 6):
+            square[i, j] += sums[k]
+            k += 1
+        vector[i] += sums[k]
+        k += 1
 
 
 @kernel

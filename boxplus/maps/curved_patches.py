@@ -23,10 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.filtering.nav_state import PL, RL, P, R
 from boxplus.filtering.plane_information import MISFITS, USED
 from boxplus.filtering.small_linalg import cholesky_inverse_into
+from boxplus.filtering.triples import placed, rotation_of, triple_of
 from boxplus.maps.ikd_tree.search import IkdView, copy_found, knn
-from boxplus.maps.plane_confirmation import leverage_into
+from boxplus.maps.plane_confirmation import leverage_of
+from boxplus.maps.plane_matching import WEIGHT
 
 PATCH = 15
 _TERMS = 6
@@ -70,17 +73,19 @@ def bend_planes(
         found_sq: (PATCH,), stack: (STACK_DEPTH + PATCH,), scratch.
     """
     near = np.empty((PATCH, 3), dtype=np.float32)
-    h, y = np.zeros(12), np.empty(3)
+    rotation, mounting, place, lever = rotation_of(x, R), rotation_of(x, RL), triple_of(x, P), triple_of(x, PL)
+    y = np.empty(3)
     heights, rows = np.empty((PATCH, 2)), np.empty((PATCH, _TERMS))
     square, sums = np.empty((3, _TERMS, _TERMS)), np.empty((2, _TERMS))
     count = 0
     for n in range(len(fate)):
         if fate[n] != USED or not planes[n, 4] > map_variance:
             continue
-        if not leverage_into(x, p_lidar[n], planes[n], covariance, h, y) > least_leverage:
+        s = placed(mounting, lever, triple_of(p_lidar[n], 0))
+        if not leverage_of(planes[n, WEIGHT], s, triple_of(planes[n], 0), rotation, covariance) > least_leverage:
             continue
-        for i in range(3):
-            y[i] -= origin[i]
+        p_world = placed(rotation, place, s)
+        y[0], y[1], y[2] = p_world[0] - origin[0], p_world[1] - origin[1], p_world[2] - origin[2]
         found = knn(view, np.float32(y[0]), np.float32(y[1]), np.float32(y[2]), np.float32(max_distance_sq), found_sq, stack)
         if found < PATCH:
             continue

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
-from boxplus.filtering.plane_information import UNCONFIRMED, USED, pose_row
+from boxplus.filtering.plane_information import UNCONFIRMED, USED
+from boxplus.filtering.triples import Rotation, Triple, cross, placed, rotation_of, triple_of, turned_back
 from boxplus.maps.ikd_tree.search import IkdView, copy_found, has_within, knn
 from boxplus.maps.plane_matching import WEIGHT
 
@@ -27,37 +28,21 @@ LEVERAGE = 3.0  # times the mean: about one plane in twenty exceeds it
 DENSE_CELLS = 4.0
 
 
-@kernel(inline=True)
-def leverage_into(
-    x: NDArray[np.float64],
-    p_lidar: NDArray[np.float32],
-    plane: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    h: NDArray[np.float64],
-    y: NDArray[np.float64],
-) -> float:
-    """The leverage of a plane with its weight, given the covariance (6, 6) of the pose.
+@kernel(inline=True, fastmath=True)
+def leverage_of(weight: float, s: Triple, u: Triple, rotation: Rotation, covariance: NDArray[np.float64]) -> float:
+    """The leverage w hᵀ P h of a plane, given the covariance P (6, 6) of the pose.
 
     Args:
-        x: (36,) state; p_lidar: (3,) the point, LiDAR frame; plane: (PLANE,).
-        h: (12,) receives the row of the point, y: (3,) where it lies in the world.
+        s: the point on it, IMU frame; u: its normal, world; rotation: R_world_imu.
     """
-    lidar = (np.float64(p_lidar[0]), np.float64(p_lidar[1]), np.float64(p_lidar[2]))
-    sx = x[RL] * lidar[0] + x[RL + 1] * lidar[1] + x[RL + 2] * lidar[2] + x[PL]
-    sy = x[RL + 3] * lidar[0] + x[RL + 4] * lidar[1] + x[RL + 5] * lidar[2] + x[PL + 1]
-    sz = x[RL + 6] * lidar[0] + x[RL + 7] * lidar[1] + x[RL + 8] * lidar[2] + x[PL + 2]
-    pose_row(x, lidar, (sx, sy, sz), (plane[0], plane[1], plane[2]), False, h)
-    half = 0.0
-    for i in range(6):
-        column = 0.5 * covariance[i, i] * h[i]
-        for j in range(i):
-            column += covariance[i, j] * h[j]
-        half += column * h[i]
-    y[0] = x[R] * sx + x[R + 1] * sy + x[R + 2] * sz + x[P]
-    y[1] = x[R + 3] * sx + x[R + 4] * sy + x[R + 5] * sz + x[P + 1]
-    y[2] = x[R + 6] * sx + x[R + 7] * sy + x[R + 8] * sz + x[P + 2]
-    leverage: float = 2.0 * plane[WEIGHT] * half
-    return leverage
+    turn = cross(s, turned_back(rotation, u))  # h = [s × Rᵀu, u] (docs/lidar_inertial_odometry.md, section 6)
+    total = 0.0
+    for i in range(3):
+        of_turn = covariance[i, 0] * turn[0] + covariance[i, 1] * turn[1] + covariance[i, 2] * turn[2]
+        of_place = covariance[3 + i, 3] * u[0] + covariance[3 + i, 4] * u[1] + covariance[3 + i, 5] * u[2]
+        between = covariance[i, 3] * u[0] + covariance[i, 4] * u[1] + covariance[i, 5] * u[2]
+        total += turn[i] * (of_turn + 2.0 * between) + u[i] * of_place
+    return weight * total
 
 
 @kernel
@@ -93,15 +78,16 @@ def confirm_planes(
     """
     wanted = len(found_sq)
     near = np.empty((wanted, 3), dtype=np.float32)
-    h, y = np.zeros(12), np.empty(3)
+    rotation, mounting, place, lever = rotation_of(x, R), rotation_of(x, RL), triple_of(x, P), triple_of(x, PL)
     refused = 0
     for n in range(len(fate)):
         if fate[n] != USED:
             continue
         plane = planes[n]
-        u = (plane[0], plane[1], plane[2])
-        if not leverage_into(x, p_lidar[n], plane, covariance, h, y) > most_leverage:
+        u, s = triple_of(plane, 0), placed(mounting, lever, triple_of(p_lidar[n], 0))
+        if not leverage_of(plane[WEIGHT], s, u, rotation, covariance) > most_leverage:
             continue
+        y = placed(rotation, place, s)
         yx, yy, yz = np.float32(y[0] - origin[0]), np.float32(y[1] - origin[1]), np.float32(y[2] - origin[2])
         if has_within(view, yx, yy, yz, np.float32(dense_sq), wanted, stack):
             continue

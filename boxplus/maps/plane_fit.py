@@ -14,6 +14,7 @@ from boxplus.filtering.small_linalg import symmetric_eigen_into
 
 COINCIDENT_M = 1e-6
 COLLINEAR_RATIO = 0.05
+_MOST_STEPS, _EXACT = 50, 1e-15  # of two roots that are one, each step halves the distance
 
 
 @kernel(inline=True)
@@ -28,9 +29,8 @@ def fit_plane_into(points: NDArray[np.float32], count: int, max_distance: float,
         qx += points[i, 0]
         qy += points[i, 1]
         qz += points[i, 2]
-    qx /= count
-    qy /= count
-    qz /= count
+    share = 1.0 / count
+    qx, qy, qz = qx * share, qy * share, qz * share
     xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(count):
         dx, dy, dz = points[i, 0] - qx, points[i, 1] - qy, points[i, 2] - qz
@@ -40,18 +40,21 @@ def fit_plane_into(points: NDArray[np.float32], count: int, max_distance: float,
         yy += dy * dy
         yz += dy * dz
         zz += dz * dz
-    # Eigenvalues of the scatter matrix in closed form (trigonometric solution of the characteristic cubic).
-    mean = (xx + yy + zz) / 3.0
-    ax, ay, az = xx - mean, yy - mean, zz - mean
-    off = xy * xy + xz * xz + yz * yz
-    scale = math.sqrt((ax * ax + ay * ay + az * az + 2.0 * off) / 6.0)
-    if 3.0 * mean < COINCIDENT_M * COINCIDENT_M or scale <= 0.0:
-        return False
-    half_det = (ax * (ay * az - yz * yz) - xy * (xy * az - yz * xz) + xz * (xy * yz - ay * xz)) / (2.0 * scale**3)
-    angle = math.acos(min(1.0, max(-1.0, half_det))) / 3.0
-    largest = mean + 2.0 * scale * math.cos(angle)
-    smallest = mean + 2.0 * scale * math.cos(angle + 2.0943951023931953)
-    middle = 3.0 * mean - largest - smallest
+    # Eigenvalues of the scatter matrix: the roots of λ³ − tλ² + mλ − d. Below the smallest one the cubic bends one way only:
+    # Newton's method climbs to it from 0, in three to five steps where it is small against the others, as that of a plane is.
+    t, m = xx + yy + zz, xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
+    d = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    if t < COINCIDENT_M * COINCIDENT_M or not m >= COLLINEAR_RATIO * COLLINEAR_RATIO * t * t / 9.0:
+        return False  # in one place, or of two roots that are nothing beside the largest
+    smallest = 0.0
+    for _ in range(_MOST_STEPS):
+        step = (d - ((smallest - t) * smallest + m) * smallest) / ((3.0 * smallest - 2.0 * t) * smallest + m)
+        smallest += step
+        if not step > _EXACT * t:
+            break
+    both = t - smallest
+    largest = 0.5 * (both + math.sqrt(max(both * both - 4.0 * (m - smallest * both), 0.0)))
+    middle = both - largest
     if not middle >= COLLINEAR_RATIO * COLLINEAR_RATIO * largest:
         return False
     # The normal is orthogonal to the rows of M − λI: the longest of their three cross products.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from boxplus._jit import kernel
 from boxplus.filtering.nav_state import PL, RL, P, R
 from boxplus.filtering.plane_information import FEW_NEIGHBOURS, NOT_A_PLANE, ONE_LINE, USED
+from boxplus.filtering.triples import Triple, cross, dot, placed, product, rotation_of, triple_of, turned
 from boxplus.maps.ikd_tree.search import IkdView, copy_found, knn, knn5
 from boxplus.maps.plane_fit import fit_plane_into
 
@@ -72,16 +73,14 @@ def match_planes(
     fit = np.empty(9)
     many = np.empty((MANY, 3), dtype=np.float32)
     many_sq = np.empty(MANY, dtype=np.float32)
+    rotation = rotation_of(x, R)
+    R_world_lidar, arm = product(rotation, rotation_of(x, RL)), placed(rotation, triple_of(x, P), triple_of(x, PL))
+    p_lidar_origin = arm[0] - origin[0], arm[1] - origin[1], arm[2] - origin[2]
     for n in range(begin, end):
-        lx, ly, lz = np.float64(p_lidar[n, 0]), np.float64(p_lidar[n, 1]), np.float64(p_lidar[n, 2])
-        sx = x[RL] * lx + x[RL + 1] * ly + x[RL + 2] * lz + x[PL]
-        sy = x[RL + 3] * lx + x[RL + 4] * ly + x[RL + 5] * lz + x[PL + 1]
-        sz = x[RL + 6] * lx + x[RL + 7] * ly + x[RL + 8] * lz + x[PL + 2]
-        yx = x[R] * sx + x[R + 1] * sy + x[R + 2] * sz + x[P] - origin[0]
-        yy = x[R + 3] * sx + x[R + 4] * sy + x[R + 5] * sz + x[P + 1] - origin[1]
-        yz = x[R + 6] * sx + x[R + 7] * sy + x[R + 8] * sz + x[P + 2] - origin[2]
+        ray = turned(R_world_lidar, triple_of(p_lidar[n], 0))
+        y = ray[0] + p_lidar_origin[0], ray[1] + p_lidar_origin[1], ray[2] + p_lidar_origin[2]
         near = neighbours[n]
-        qx, qy, qz = np.float32(yx), np.float32(yy), np.float32(yz)  # far from the origin, rounding exceeds the slack
+        qx, qy, qz = np.float32(y[0]), np.float32(y[1]), np.float32(y[2])  # far from the origin, rounding exceeds the slack
         seen = reach[n]
         asked = warm and seen[3] > 0.0  # on a line before, it will be on one again: one search for fifteen finds five as well
         found = np.int64(0)
@@ -111,10 +110,7 @@ def match_planes(
         if not fit_plane_into(near, NEIGHBOURS, plane_threshold, fit):
             fate[n] = NOT_A_PLANE
             continue
-        rx = x[R] * (sx - x[PL]) + x[R + 1] * (sy - x[PL + 1]) + x[R + 2] * (sz - x[PL + 2])
-        ry = x[R + 3] * (sx - x[PL]) + x[R + 4] * (sy - x[PL + 1]) + x[R + 5] * (sz - x[PL + 2])
-        rz = x[R + 6] * (sx - x[PL]) + x[R + 7] * (sy - x[PL + 1]) + x[R + 8] * (sz - x[PL + 2])
-        on_line = _lies_on_line(fit, NEIGHBOURS, rx, ry, rz)
+        on_line = _lies_on_line(fit, NEIGHBOURS, ray)
         fitted = near
         if on_line:
             if not asked:
@@ -122,7 +118,7 @@ def match_planes(
                 copy_found(view, stack, MANY, found, many)
             if found == MANY:
                 seen[0], seen[1], seen[2], seen[3] = qx, qy, qz, np.float32(math.sqrt(many_sq[MANY - 1]))
-                on_line = not fit_plane_into(many, MANY, plane_threshold, fit) or _lies_on_line(fit, MANY, rx, ry, rz)
+                on_line = not fit_plane_into(many, MANY, plane_threshold, fit) or _lies_on_line(fit, MANY, ray)
                 fitted = many
         if on_line:
             fate[n] = ONE_LINE
@@ -139,11 +135,10 @@ def match_planes(
             )
 
 
-@kernel(inline=True)
-def _lies_on_line(fit: NDArray[np.float64], count: int, rx: float, ry: float, rz: float) -> bool:
+@kernel(inline=True, fastmath=True)
+def _lies_on_line(fit: NDArray[np.float64], count: int, ray: Triple) -> bool:
     """Whether the points of a plane are those of one scan line, given the ray (3,) from the sensor to it."""
-    range_sq = rx * rx + ry * ry + rz * rz
-    along_normal = fit[0] * rx + fit[1] * ry + fit[2] * rz
+    range_sq, along_normal = dot(ray, ray), dot(triple_of(fit, 0), ray)
     too_thin = fit[8] < _MIN_SPREAD * count * min(1.0, range_sq * range_sq / _FAR**4)
     return bool(too_thin or along_normal * along_normal < _GRAZING * _GRAZING * range_sq)
 
@@ -176,52 +171,45 @@ def settle_normals(
             total += plane_threshold * plane_threshold
             count += 1
     common = total / max(count, 1)
+    R_world_lidar = product(rotation_of(x, R), rotation_of(x, RL))
     for n in range(len(fate)):
         if fate[n] != USED:
             continue
         plane = planes[n]
         plane[13] = (_OWN_DOF * plane[4] + _PRIOR_DOF * common) / (_OWN_DOF + _PRIOR_DOF)
-        lx, ly, lz = np.float64(p_lidar[n, 0]), np.float64(p_lidar[n, 1]), np.float64(p_lidar[n, 2])
-        ix, iy, iz = (
-            x[RL] * lx + x[RL + 1] * ly + x[RL + 2] * lz,
-            x[RL + 3] * lx + x[RL + 4] * ly + x[RL + 5] * lz,
-            x[RL + 6] * lx + x[RL + 7] * ly + x[RL + 8] * lz,
-        )
-        rx = x[R] * ix + x[R + 1] * iy + x[R + 2] * iz
-        ry = x[R + 3] * ix + x[R + 4] * iy + x[R + 5] * iz
-        rz = x[R + 6] * ix + x[R + 7] * iy + x[R + 8] * iz
-        across = plane[0] * rx + plane[1] * ry + plane[2] * rz
-        first = plane[5] * rx + plane[6] * ry + plane[7] * rz
-        second = plane[9] * rx + plane[10] * ry + plane[11] * rz
+        ray = turned(R_world_lidar, triple_of(p_lidar[n], 0))
+        across, first, second = dot(triple_of(plane, 0), ray), dot(triple_of(plane, 5), ray), dot(triple_of(plane, 9), ray)
         if across * across < _DEVIATIONS * _DEVIATIONS * plane[13] * (first * first + second * second):
             fate[n] = ONE_LINE
 
 
-@kernel(inline=True)
+@kernel(inline=True, fastmath=True)
 def _normal_uncertainty(near: NDArray[np.float32], fit: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
     """Two vectors g₁, g₂ in the plane with Cov(u) = σ² (g₁g₁ᵀ + g₂g₂ᵀ), σ² the variance of a map point.
 
     Their sum of outer products is the inverse of the points' scatter within the plane.
     """
-    ux, uy, uz = fit[0], fit[1], fit[2]
+    ux, uy, uz = triple_of(fit, 0)
     if abs(ux) < 0.6:
         norm = 1.0 / math.sqrt(uy * uy + uz * uz)
-        ex, ey, ez = 0.0, uz * norm, -uy * norm
+        e = 0.0, uz * norm, -uy * norm
     else:
         norm = 1.0 / math.sqrt(ux * ux + uz * uz)
-        ex, ey, ez = -uz * norm, 0.0, ux * norm
-    fx, fy, fz = uy * ez - uz * ey, uz * ex - ux * ez, ux * ey - uy * ex
+        e = -uz * norm, 0.0, ux * norm
+    f = cross((ux, uy, uz), e)
+    middle = triple_of(fit, 4)
     ee, ef, ff = 0.0, 0.0, 0.0
     for i in range(len(near)):
-        dx, dy, dz = near[i, 0] - fit[4], near[i, 1] - fit[5], near[i, 2] - fit[6]
-        e = ex * dx + ey * dy + ez * dz
-        f = fx * dx + fy * dy + fz * dz
-        ee += e * e
-        ef += e * f
-        ff += f * f
+        p = triple_of(near[i], 0)
+        d = p[0] - middle[0], p[1] - middle[1], p[2] - middle[2]
+        along, aside = dot(e, d), dot(f, d)
+        ee += along * along
+        ef += along * aside
+        ff += aside * aside
     # Cholesky factor of the inverse of [[ee, ef], [ef, ff]].
     first = math.sqrt(ff / (ee * ff - ef * ef))
     mixed = -first * ef / ff
     second = 1.0 / math.sqrt(ff)
-    plane[5], plane[6], plane[7] = first * ex + mixed * fx, first * ey + mixed * fy, first * ez + mixed * fz
-    plane[9], plane[10], plane[11] = second * fx, second * fy, second * fz
+    for i in range(3):
+        plane[5 + i] = first * e[i] + mixed * f[i]
+        plane[9 + i] = second * f[i]

@@ -106,10 +106,10 @@ class PlaneMeasurement:
         matches = rematch or not self._matched
         if matches:
             self._match(x)
-        total = self._sums(x, edges, criterion=matches)
-        if matches and self._confirm and self._look_closer(x, total[0].sum(axis=0), int(total[4][0])):
-            total = self._sums(x, edges, criterion=True)
-        A, b, pull, noise, sums = total
+        if matches and self._confirm:
+            A, _, _, _, sums = self._sums(x, edges, criterion=False)
+            self._look_closer(x, A.sum(axis=0), int(sums[0]))
+        A, b, pull, noise, sums = self._sums(x, edges, criterion=matches)
         if matches:  # in between the planes stay, and what they can tell
             self._pull = pull
             threshold = threshold_for(self._config.weak_threshold, int(sums[0]))
@@ -160,22 +160,19 @@ class PlaneMeasurement:
         )  # fmt: skip
         return A, b, pull, noise, sums
 
-    def _look_closer(self, x: NDArray[np.float64], information: NDArray[np.float64], used: int) -> bool:
+    def _look_closer(self, x: NDArray[np.float64], information: NDArray[np.float64], used: int) -> None:
         """Refuse planes on which too much hangs (`plane_confirmation`), bend those that are none (`curved_patches`).
 
         Args:
             x: (36,) packed state.
             information: (12, 12) of all planes, from so many points `used`.
-
-        Returns:
-            Whether any was refused or bent.
         """
         config = self._config
         covariance, work = np.empty((2, 6, 6))
         if not cholesky_inverse_into(np.ascontiguousarray(information[:6, :6]), covariance, work):
-            return False  # nothing at all measures some direction
+            return  # nothing at all measures some direction
         mean_leverage = 6.0 / max(used, 1)
-        refused = confirm_planes(
+        confirm_planes(
             self._tree.view(),
             self._tree.origin,
             x,
@@ -209,7 +206,6 @@ class PlaneMeasurement:
             np.zeros(STACK_DEPTH + PATCH, dtype=STACK),
         )
         self._planes[which[:count]] = bent[:count]
-        return bool(refused or count)
 
     def _match(self, x: NDArray[np.float64]) -> None:
         view, origin, config = self._tree.view(), self._tree.origin, self._config
