@@ -84,6 +84,7 @@ BENCHMARKS = {
     "scan": Benchmark(("--rounds", "1", "--duration", "8")),
     "recordings": Benchmark(("--rounds", "1", "--only", "v103_velodyne")),
     "lidar_alone": Benchmark(("--only", "v103_velodyne")),
+    "lidar_start": Benchmark(("--seeds", "1:7"), arguments=("--half", "odd", "--seeds", "1:173")),
     "map_growth": Benchmark(("--batches", "100", "--duration", "10")),
     "memory": Benchmark(("--minutes", "3")),
     "cholesky": Benchmark(("--rounds", "2", "--only", "intel", "MIT")),
