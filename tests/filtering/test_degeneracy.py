@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from boxplus.filtering.degeneracy import pose_directions, strong_step, threshold_for
+from boxplus.filtering.degeneracy import PoseDirections, pose_directions, strong_covariance, strong_step, threshold_for
 from boxplus.filtering.nav_state import NavState
 from tests.filtering.noisy_planes import LEVER_ARM, information, noise, tilted, tube, unit_vector
 from tests.filtering.random_states import random_state
@@ -138,3 +138,21 @@ def test_chance_seldom_calls_a_direction_measured_that_is_not() -> None:
         called += not pose_directions(A[:6, :6], N, LEVER_ARM, threshold_for(1.3, 400)).weak[0]
         assert pose_directions(A[:6, :6], N, LEVER_ARM, 0.0).ratios[0] < 2.5
     assert called <= 6
+
+
+@given(seeds, st.integers(0, 6))
+def test_the_covariance_is_that_of_what_is_left_of_the_pose(seed: int, weak: int) -> None:
+    random = np.random.default_rng(seed)
+    basis, root = random.normal(size=(6, 6)), random.normal(size=(12, 12))
+    A = root @ root.T
+    strong = np.arange(6) >= weak
+    found = strong_covariance(A, PoseDirections(np.ones(6), np.eye(6), 1.0, ~strong, basis))
+    V = basis[:, strong]
+    expected = V @ np.linalg.solve(V.T @ A[:6, :6] @ V, V.T)
+    assert np.allclose(found, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max(initial=1e-300))
+
+
+def test_no_information_along_a_direction_that_is_not_weak_is_an_error() -> None:
+    directions = PoseDirections(np.ones(6), np.eye(6), 1.0, np.zeros(6, bool), np.eye(6))
+    with pytest.raises(np.linalg.LinAlgError, match="zero along a direction"):
+        strong_covariance(np.diag([1.0, 1.0, 0.0, 1.0, 1.0, 1.0]), directions)

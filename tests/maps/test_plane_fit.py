@@ -81,6 +81,24 @@ def test_far_from_the_origin_as_well_as_near(seed: int) -> None:
     assert np.abs(moved @ far[:3] - far[3]).max() < 0.1
 
 
+@given(seeds, st.floats(-6.0, 0.0), st.floats(-1.2, 0.0), st.sampled_from([5, 15]))
+def test_variances_of_any_shape_are_those_of_lapack(seed: int, thin: float, narrow: float, count: int) -> None:
+    """From sheets to balls, two extents alike among them, at any place."""
+    random = np.random.default_rng(seed)
+    frame, _ = np.linalg.qr(random.normal(size=(3, 3)))
+    extent = np.array([1.0, 10.0**narrow, 10.0 ** min(thin, narrow)]) * 10.0 ** random.uniform(-2.0, 1.0)
+    points = ((random.normal(size=(count, 3)) * extent) @ frame.T + random.uniform(-50.0, 50.0, 3)).astype(np.float32)
+    plane = _fit(points, limit=np.inf)
+    scatter = np.cov(points.T.astype(np.float64), bias=True) * count
+    smallest, middle, largest = np.linalg.eigvalsh(scatter)
+    if plane is None:
+        assert middle < 1.001 * COLLINEAR_RATIO**2 * largest
+        return
+    assert plane[7] * (count - 3) == pytest.approx(max(smallest, 0.0), abs=1e-11 * largest)
+    assert plane[8] == pytest.approx(middle, abs=1e-11 * largest)
+    assert plane[:3] @ scatter @ plane[:3] == pytest.approx(smallest, abs=1e-9 * largest)
+
+
 @given(seeds)
 def test_the_order_of_the_points_does_not_matter(seed: int) -> None:
     points = _patch(seed, 0.01)
