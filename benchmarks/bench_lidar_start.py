@@ -139,7 +139,7 @@ def report(lines: Sequence[dict[str, Any]]) -> str:
 
 def figures(lines: Sequence[dict[str, Any]]) -> list[Metric]:
     """What a baseline holds: paths that are wrong."""
-    share = 100.0 * sum(line["wrong"] for line in lines) / len(lines)
+    share = 100.0 * sum(line["wrong"] for line in lines) / max(len(lines), 1)
     return [Metric("lidar_start/paths wrong", share, "%", "lower", 0.0, tolerance=0.2)]
 
 

@@ -114,7 +114,7 @@ def accumulate_planes(
         s = placed(mounting, lever, p)
         y = placed(rotation, place, s)
         z = dot(u, y) - plane[3]
-        if not (81.0 * z * z) ** 2 < dot(p, p):
+        if not (81.0 * z * z) ** 2 < dot(p, p):  # 81 z² < ‖ℓ‖
             fate[n] = GATED
             continue
         fate[n] = USED
@@ -136,8 +136,8 @@ def accumulate_planes(
             _add_product(crossed[2], weight, u, turn_on_it)
             _add_product(crossed[3], weight, u, C)
         if with_criterion:
-            # Cov(u) = m² (gᵢgᵢᵀ) with the variance m² that counts for the normal (column 13 of the record): as large as the noise
-            # really is, whatever the settings say. It is linear in the noise; a unit vector cannot tilt further than by a radian.
+            # Cov(u) = m² (ggᵀ + kkᵀ) with the variance m² that counts for the normal (column 13 of the record): as large as the
+            # noise really is, whatever the settings say. It is linear in the noise; a unit vector tilts by a radian at most.
             for v, vv, beside in ((g, gg, t0), (k, kk, t1)):
                 factor = weight * plane[13] / (1.0 + plane[13] * vv)
                 C = turned_back(rotation, v)

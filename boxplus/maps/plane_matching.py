@@ -74,11 +74,11 @@ def match_planes(
     many = np.empty((MANY, 3), dtype=np.float32)
     many_sq = np.empty(MANY, dtype=np.float32)
     rotation = rotation_of(x, R)
-    R_world_lidar, arm = product(rotation, rotation_of(x, RL)), placed(rotation, triple_of(x, P), triple_of(x, PL))
-    p_lidar_origin = arm[0] - origin[0], arm[1] - origin[1], arm[2] - origin[2]
+    R_world_lidar, p_world_lidar = product(rotation, rotation_of(x, RL)), placed(rotation, triple_of(x, P), triple_of(x, PL))
+    p_map_lidar = p_world_lidar[0] - origin[0], p_world_lidar[1] - origin[1], p_world_lidar[2] - origin[2]
     for n in range(begin, end):
         ray = turned(R_world_lidar, triple_of(p_lidar[n], 0))
-        y = ray[0] + p_lidar_origin[0], ray[1] + p_lidar_origin[1], ray[2] + p_lidar_origin[2]
+        y = ray[0] + p_map_lidar[0], ray[1] + p_map_lidar[1], ray[2] + p_map_lidar[2]
         near = neighbours[n]
         qx, qy, qz = np.float32(y[0]), np.float32(y[1]), np.float32(y[2])  # far from the origin, rounding exceeds the slack
         seen = reach[n]

@@ -20,13 +20,15 @@ def sample_noise(imu: ImuSamples) -> NDArray[np.float64]:
     Vibration is in it, as far as the sensor does not filter it out; errors of scale, of axes and of the clock are not.
 
     Args:
-        imu: at least three samples, at a steady rate.
+        imu: at a steady rate; fewer than three samples show nothing.
 
     Example:
         >>> rest = ImuSamples.from_arrays(np.arange(5) * 5_000_000, np.zeros((5, 3)), np.full((5, 3), 9.8))
         >>> sample_noise(rest).max()
         np.float64(0.0)
     """
+    if len(imu) < 3:
+        return np.zeros((2, 3))  # no second difference shows any
     steps = np.sort(np.diff(imu.time_ns))
     step_s = 0.5e-9 * float(steps[(len(steps) - 1) // 2] + steps[len(steps) // 2])  # their median
     noise = np.zeros((2, 3))

@@ -75,7 +75,7 @@ def glitches(imu: ImuSamples) -> NDArray[np.bool_]:
 
 @kernel
 def _any_far(time_ns: NDArray[np.int64], gyro: NDArray[np.float64], accel: NDArray[np.float64]) -> bool:
-    """Whether any sample is farther from the one before than a platform could turn or be pushed: nearly always none is."""
+    """Whether any sample is far from the one before, by the rule of `glitches`: nearly always none is."""
     for k in range(1, len(time_ns)):
         seconds = 1e-9 * (time_ns[k] - time_ns[k - 1])
         turned = pushed = 0.0

@@ -315,7 +315,11 @@ def _lidar_twist(x_before: NDArray[np.float64], x: NDArray[np.float64], seconds:
 def _largest_innovation(
     vectors: NDArray[np.float64], weak: NDArray[np.bool_], lever_arm: float, off: NDArray[np.float64], cov: NDArray[np.float64]
 ) -> float:
-    """Over the directions (columns of (6, 6)) that are not weak, the largest square of `off` (6,), by the variance there."""
+    """Over the directions (columns of (6, 6)) that are not weak, the largest square of `off` (6,), by the variance there.
+
+    Args:
+        cov: (n, n), of the pose first.
+    """
     largest, along = 0.0, np.empty(6)
     for direction in range(6):
         if weak[direction]:
