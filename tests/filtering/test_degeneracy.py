@@ -156,3 +156,9 @@ def test_no_information_along_a_direction_that_is_not_weak_is_an_error() -> None
     directions = PoseDirections(np.ones(6), np.eye(6), 1.0, np.zeros(6, bool), np.eye(6))
     with pytest.raises(np.linalg.LinAlgError, match="zero along a direction"):
         strong_covariance(np.diag([1.0, 1.0, 0.0, 1.0, 1.0, 1.0]), directions)
+
+
+def test_elimination_goes_on_where_the_first_number_is_zero() -> None:
+    A = np.eye(6)[[1, 0, 2, 3, 4, 5]]
+    directions = PoseDirections(np.ones(6), np.eye(6), 1.0, np.zeros(6, bool), np.eye(6))
+    assert np.array_equal(strong_covariance(A, directions), A)

@@ -245,3 +245,27 @@ def test_sampled_errors_between_two_poses_spread_as_it_says(facing: float, turne
 
 def _turned(M: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return turn @ M @ turn.T
+
+
+@given(seeds, st.integers(0, 400))
+def test_a_map_takes_over_a_share_of_the_error_of_the_pose(seed: int, points: int) -> None:
+    random = np.random.default_rng(seed)
+    datum = MapDatum(_state(np.eye(3), np.zeros(3)), np.eye(24))
+    root = random.normal(size=(2, 12, 12))
+    datum._joint, datum._local_points = root @ root.swapaxes(1, 2), 100.0
+    before = datum._joint.copy()
+    datum.insert(points)
+    step = np.eye(12)
+    step[6:, 6:] *= 1.0 - datum.new_share
+    step[6:, :6] = datum.new_share * np.eye(6)
+    assert datum.new_share == points / (100.0 + points)
+    assert np.allclose(datum._joint, step @ before @ step.T, atol=1e-11)
+
+
+@given(seeds)
+def test_what_a_view_turns_away_from_is_compared_no_more(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    facing, moved, turned = 0.25 * random.normal(size=3), random.normal(size=3), random.normal(size=3)
+    spread = np.sqrt(max(1.0 - facing @ facing, 0.05**2))
+    left = Correction(np.eye(6), np.eye(6), np.eye(6), 5.0, facing).share_left(moved, turned)
+    assert left == pytest.approx(np.exp(-np.linalg.norm(moved) / 5.0 - np.linalg.norm(np.cross(turned, facing)) / spread))

@@ -227,3 +227,14 @@ def test_the_pull_is_what_noisy_normals_make_of_a_point_beside_the_middle_of_its
         # What chance leaves is as large where the pulls of both directions nearly cancel, and b is small.
         assert np.linalg.norm(left[block]) < 0.02 * np.linalg.norm(with_noise[block]) + 5.0 * np.linalg.norm(by_chance[block])
         assert np.linalg.norm(by_chance[block]) < 0.1 * max(np.linalg.norm(with_noise[block]), np.linalg.norm(with_noise))
+
+
+@pytest.mark.parametrize("spoilt", ["plane", "point"])
+def test_what_is_no_number_is_gated(spoilt: str) -> None:
+    random = np.random.default_rng(0)
+    x, points = random_state(random), random.normal(size=(3, 3)).astype(np.float32)
+    planes, fate = _planes_at(x, points, np.zeros(3), random), np.zeros(3, np.uint8)
+    (planes if spoilt == "plane" else points)[1, 0] = np.nan
+    A, b, sums = _accumulate(x, points, planes, fate)
+    assert fate.tolist() == [USED, GATED, USED] and sums[0] == 2.0
+    assert np.isfinite(A).all() and np.isfinite(b).all()

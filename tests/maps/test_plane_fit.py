@@ -160,3 +160,18 @@ def test_planes_through_handfuls_against_eigenvalues(seed: int, noise: float, co
 def test_handfuls_of_no_points_or_of_more_than_there_are_are_refused(count: int) -> None:
     with pytest.raises(InputError, match="expected 1 to 3 points of each plane"):
         planes_through(np.ones((2, 3, 3)), np.array([3, count]))
+
+
+@pytest.mark.parametrize("side", [0.01, 0.05, 1.0])
+def test_points_of_no_direction_have_the_variance_that_they_have(side: float) -> None:
+    """Of an octahedron all extents are one, but for rounding: the three roots of the cubic lie on each other."""
+    random, octahedron = np.random.default_rng(0), np.concatenate([np.eye(3), -np.eye(3)])
+    found = 0
+    for _ in range(1000):
+        frame, _ = np.linalg.qr(random.normal(size=(3, 3)))
+        plane = _fit(side * octahedron @ frame.T, limit=2.0 * side)
+        if plane is not None:
+            found += 1
+            assert plane[7] == pytest.approx(2.0 * side**2 / 3.0, rel=1e-3)
+            assert plane[8] == pytest.approx(2.0 * side**2, rel=1e-3)
+    assert found > 900

@@ -29,3 +29,9 @@ def test_a_motion_is_hardly_noise(turn_rate: float) -> None:
     accel = 9.8 + 3.0 * np.cos(2.0 * np.pi * time)[:, None] * np.ones(3)
     noise = sample_noise(ImuSamples(np.round(time * 1e9).astype(np.int64), gyro, accel))
     assert noise[0].max() < 2e-5 * turn_rate / 0.5 and noise[1].max() < 1.2e-4
+
+
+@pytest.mark.parametrize("samples", range(3))
+def test_fewer_than_three_samples_show_none(samples: int) -> None:
+    few = ImuSamples(1_000_000 * np.arange(samples), np.ones((samples, 3)), np.ones((samples, 3)))
+    assert np.array_equal(sample_noise(few), np.zeros((2, 3)))

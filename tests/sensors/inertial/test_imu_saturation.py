@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -108,3 +110,61 @@ def test_limits_of_a_whole_recording_are_those_that_nothing_exceeds(limit: float
     beyond = swing.copy()
     beyond[-1, 1] = 1.5 * limit * way
     assert not limits_of(ImuSamples(imu.time_ns, beyond, imu.accel))
+
+
+class InWholeBlocks:
+    """The same rule, a block of samples (n, 12) at a time along and against the axes, as the one that is compiled is not."""
+
+    def __init__(self) -> None:
+        self.peak, self.step, self.run, self.plateaus = np.zeros(12), np.full(2, np.inf), np.zeros(12, int), np.zeros(12, int)
+        self.cut_off, self.low, self.last = np.zeros(12, bool), [], np.empty((0, 6))
+
+    def update(self, along: NDArray[np.float64]) -> list[tuple[int, float]]:
+        self.low = [*self.low, np.abs(along).min(axis=0)][-20:]
+        first = self.last if len(self.last) else along[:1]
+        changes, self.last = np.abs(np.diff(np.vstack([first, along]), axis=0)), along[-1:]
+        values, limit = np.hstack([along, -along]), np.zeros(12, bool)
+        largest = np.maximum(values.max(axis=0), self.peak).reshape(2, 6).max(axis=0)
+        least = np.where(changes > 1e-6 * largest, changes, np.inf).min(axis=0)
+        self.step = np.minimum(self.step, least.reshape(2, 3).min(axis=1))
+        if (values.max(axis=0) < self.peak * (1.0 - 1e-6)).all():
+            self.run[:] = 0
+            return []
+        for value, is_cut in zip(values, np.tile(changes > 2.5 * np.repeat(self.step, 3), 2), strict=True):
+            higher = value > self.peak * (1.0 + 1e-6)
+            for forgotten in (self.plateaus, self.run, limit, self.cut_off):
+                forgotten[higher] = 0
+            at_peak = value >= self.peak * (1.0 - 1e-6)
+            self.peak = np.maximum(self.peak, value)
+            self.cut_off |= at_peak & (self.run == 0) & is_cut
+            self.run = np.where(at_peak, self.run + 1, 0)
+            self.plateaus += self.cut_off & (self.run == 3)
+            limit |= self.cut_off & (self.run >= 3) & ((self.plateaus >= 2) | (self.run >= 6))
+        limit &= self.peak - np.tile(np.min(self.low, axis=0), 2) > np.tile(np.repeat([0.5, 1.5], 3), 2)
+        return [(int(way), float(self.peak[way])) for way in np.flatnonzero(limit)]
+
+
+def test_limits_are_those_of_whole_arrays_however_samples_are_cut_into_blocks() -> None:
+    assert sum(_limits_reached(seed) > 0 for seed in range(60)) > 20
+
+
+def _limits_reached(seed: int) -> int:
+    """Swings clipped at random, in coarse or fine steps, by both; how many limits both have told."""
+    random, count = np.random.default_rng(seed), 500
+    time_s = np.arange(count) * 0.005
+    swings = np.sin(random.uniform(1.0, 20.0, 6) * time_s[:, None] + random.uniform(0.0, 6.0, 6))
+    noise = random.choice([0.0, 0.02]) * random.normal(size=(count, 6))
+    along = random.uniform(0.0, 3.0, 6) * np.repeat([1.0, 3.0], 3) * swings + noise
+    along[:, :3] = np.clip(along[:, :3], -random.uniform(0.5, 2.0), random.uniform(0.5, 2.0))
+    along[:, 3:] = np.clip(along[:, 3:], -random.uniform(2.0, 9.0), random.uniform(2.0, 9.0))
+    step = random.choice([1e-4, 0.01, 0.05])
+    along = np.round(along / step) * step
+    cuts = np.unique(np.concatenate([[0, count], random.integers(1, count, 25)]))
+    compiled, whole, reached = Saturation(), InWholeBlocks(), 0
+    for begin, end in itertools.pairwise(cuts.tolist()):
+        part = slice(max(begin - int(random.integers(0, 3)), 0), end)  # blocks may share samples at their border
+        imu = ImuSamples(np.arange(count)[part] * 5_000_000, along[part, :3].copy(), along[part, 3:].copy())
+        found = compiled.update(imu)
+        assert [(limit.way, limit.value) for limit in found] == whole.update(along[begin:end])
+        reached += len(found)
+    return reached

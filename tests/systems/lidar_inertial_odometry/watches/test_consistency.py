@@ -13,8 +13,13 @@ from boxplus.filtering.nav_state import BA, BW, T_P, TANGENT, NavState, P, V
 from boxplus.manifolds import so3
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
-from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import first_sensitivity
-from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import T_imu_lidar_of, T_world_imu_of, first_sensitivity
+from boxplus.systems.lidar_inertial_odometry.watches.consistency import (
+    _MEASUREMENT_SIGMA,
+    Consistency,
+    _largest_innovation,
+    _lidar_twist,
+)
 
 PERIOD_NS = 100_000_000
 ABOUT_Z, ALONG_X = np.eye(6)[2], np.eye(6)[T_P]
@@ -172,3 +177,32 @@ def test_whichever_sensor_turns_alone_raises_a_suspicion(by_gyroscope: float, by
         update: Any = SimpleNamespace(posterior=posterior, cov_prior=cov, cov=cov, B=B, B_prior=B)
         consistency.update(frame, x_before, x_prior, update, 1.0, 1.0)
     assert seen[-1] == suspicious
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_innovation_is_that_of_the_direction_that_is_off_most(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    vectors, weak, off = random.normal(size=(6, 6)), random.random(6) < 0.3, random.normal(size=6)
+    root = random.normal(size=(24, 24))
+    cov = root @ root.T
+    strong = vectors[:, ~weak].T * np.repeat([7.0, 1.0], 3)
+    variance = np.einsum("ij,jk,ik->i", strong, cov[:6, :6], strong) + strong**2 @ _MEASUREMENT_SIGMA**2
+    expected = np.max((strong @ off) ** 2 / variance, initial=0.0)
+    assert _largest_innovation(vectors, weak, 7.0, off, cov) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_lidar_moves_as_the_imu_carries_it(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    before, now = (
+        NavState(
+            *(so3.exp(random.normal(size=3)), random.normal(size=3), *np.zeros((4, 3))),
+            so3.exp(random.normal(size=3)),
+            random.normal(size=3),
+        ).pack()
+        for _ in range(2)
+    )
+    T_before, T_now = (T_world_imu_of(x) @ T_imu_lidar_of(x) for x in (before, now))
+    turn, velocity = _lidar_twist(before, now, 0.1)
+    assert np.allclose(so3.exp(0.1 * turn), T_before[:3, :3].T @ T_now[:3, :3], atol=1e-9)
+    assert np.allclose(T_now[:3, :3] @ velocity * 0.1, T_now[:3, 3] - T_before[:3, 3], atol=1e-12)

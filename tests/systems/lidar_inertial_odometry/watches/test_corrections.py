@@ -11,7 +11,7 @@ import pytest
 from boxplus.filtering.nav_state import TANGENT, NavState, V
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
-from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
+from boxplus.systems.lidar_inertial_odometry.watches.corrections import _FLOOR, Corrections, _deviations
 
 PERIOD_S, ACCEL_NOISE, POINT_NOISE = 0.1, 0.02, 0.01
 
@@ -114,3 +114,12 @@ def test_what_an_uncertain_mounting_adds_to_the_covariance_is_no_loss_of_it() ->
         frame: Any = SimpleNamespace(scan=SimpleNamespace(end_ns=k * 10**8), imu=range(10), largest_gap_s=0.01)
         found += consistency._pushes(frame, ONE_WAY, an_update(before, after, lever_m=0.1))
     assert not found
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_sum_is_measured_by_its_covariance_and_what_the_mounting_adds(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    total, D, root, of_mounting = (random.normal(size=size) for size in (3, (3, 6), (3, 3), (6, 6)))
+    C = root @ root.T + D @ of_mounting @ of_mounting.T @ D.T + _FLOOR**2 * np.eye(3)
+    found = _deviations(total, root @ root.T, D, of_mounting @ of_mounting.T)
+    assert found == pytest.approx(np.sqrt(total @ np.linalg.solve(C, total)))

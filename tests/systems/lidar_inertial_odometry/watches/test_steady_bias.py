@@ -70,3 +70,15 @@ def test_what_a_gyroscopes_scale_makes_of_turns_is_no_bias_that_moved(scale: flo
     at_rest = SteadyBias(1e-6)
     assert at_rest.update(0, np.zeros(3), known, np.zeros(3)) is None
     assert at_rest.update(10**9, np.full(3, 0.012), known, np.zeros(3))
+
+
+def test_an_estimate_counts_with_what_the_mounting_left_open_then() -> None:
+    """The bias moves by ten deviations of what is known, but the mounting, unknown at first and known later, explains it."""
+    steady, known = SteadyBias(1e-6), np.full(3, 1e-6)
+    assert steady.update(0, np.zeros(3), known, np.full(3, 0.01**2)) is None
+    assert steady.update(10**9, np.full(3, 0.01), np.full(3, 1e-8), np.zeros(3)) is None
+    certain = SteadyBias(1e-6)
+    assert certain.update(0, np.zeros(3), known, np.zeros(3)) is None
+    assert "has moved by 0.57 deg/s within 1.0 s" in (
+        certain.update(10**9, np.full(3, 0.01), np.full(3, 1e-8), np.zeros(3)) or ""
+    )

@@ -214,3 +214,18 @@ def test_a_gyroscope_that_gives_zeros_from_the_start_is_named(seed: int) -> None
     told = "the gyroscope has given the same values sample after sample, although the scans turn"
     assert any(told in text for text in warnings)
     assert odometry.contradiction is not None
+
+
+def test_turns_while_a_gyroscope_repeated_itself_are_forgotten_once_it_works_again() -> None:
+    """It repeats itself for a second twice, and the scans turn by 3 degrees each time: together that would be too much."""
+    random, time = np.random.default_rng(0), np.arange(8 * RATE_HZ) / RATE_HZ
+    accel = np.tile([0.0, 0.0, 9.81], (len(time), 1)) + 0.02 * random.normal(size=(len(time), 3))
+    gyro = 0.002 * random.normal(size=accel.shape)
+    rates = np.zeros_like(gyro)
+    for begin in (2.0, 3.2):
+        stuck = (time >= begin) & (time < begin + 1.0)
+        gyro[stuck] = gyro[np.flatnonzero(stuck)[0]]
+        rates[stuck & (time >= begin + 0.6), 2] = np.deg2rad(3.0) / 0.4
+    assert not told(gyro, accel, rates=rates)
+    rates[:, 2] *= 2.0
+    assert told(gyro, accel, rates=rates)

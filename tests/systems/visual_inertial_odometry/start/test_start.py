@@ -8,17 +8,19 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from boxplus.manifolds import quaternion
+from boxplus.residuals.inertial.imu_noise import ImuNoise
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.visual_inertial_odometry import Rig, VioConfig
 from boxplus.systems.visual_inertial_odometry.corners.tracks import Tracks
 from boxplus.systems.visual_inertial_odometry.start.search import StartSearch
-from boxplus.systems.visual_inertial_odometry.start.start import Start
+from boxplus.systems.visual_inertial_odometry.start.start import Start, find_rest
 
 CONFIG = VioConfig()
 
@@ -149,3 +151,10 @@ def test_the_same_frames_give_the_same_bits(bench) -> None:
         assert first == again
     else:
         assert isinstance(again, Start) and np.array_equal(first.T_world_imu, again.T_world_imu)
+
+
+def test_two_samples_are_too_few_to_tell_rest() -> None:
+    seen: Any = [SimpleNamespace(time_ns=0), SimpleNamespace(time_ns=10**9)]
+    imu = ImuSamples(np.array([-1, 10**9 + 1]), np.zeros((2, 3)), np.ones((2, 3)))
+    rig: Any = SimpleNamespace(noise=ImuNoise(1e-3, 1e-2, 1e-4, 1e-3))
+    assert find_rest(seen, imu, rig, CONFIG) == "0 IMU samples in 1.00 s (10 are needed)"
