@@ -13,7 +13,7 @@ from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import sites, worlds
-from boxplus.systems.lidar_inertial_agreement.lidar_path import track
+from boxplus.systems.lidar_inertial_agreement.lidar_path import scan_fit
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, FINE, data, handheld, true_poses, true_twists
@@ -41,7 +41,7 @@ def test_a_path_beside_an_estimate_is_as_near_to_the_truth(
         asked.append(len(points))
         return PlaneMeasurement(points, *arguments, **options)
 
-    monkeypatch.setattr(track, "PlaneMeasurement", measurement)
+    monkeypatch.setattr(scan_fit, "PlaneMeasurement", measurement)
     expected = true_twists(simulation, scans, factor)
     beside = lidar_path(scans, CONFIG, expected=expected)
     whole = sum(points > 0.6 * max(asked) for points in asked)
@@ -71,7 +71,7 @@ def test_where_a_third_of_the_points_is_too_few_all_of_them_count() -> None:
 def test_what_is_held_along_the_way_is_registered_with_all_points(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = handheld(4, 4.0, lidar=FINE)
     scans, _ = data(simulation)
-    monkeypatch.setattr(track.Track, "_roughly", None)  # nothing asks for it
+    monkeypatch.setattr(scan_fit.ScanFitter, "_roughly", None)  # nothing asks for it
     assert lidar_path(scans[:6], CONFIG, expected=true_twists(simulation, scans[:6]), held=True).failed == 0
 
 
