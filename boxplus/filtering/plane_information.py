@@ -69,7 +69,7 @@ def _add_product(sums: NDArray[np.float64], w: float, left: Triple, right: Tripl
         sums[3 * i + 2] += weighted * right[2]
 
 
-@kernel(fastmath=True)
+@kernel(inline=True, fastmath=True)
 def accumulate_planes(
     x: NDArray[np.float64],
     p_lidar: NDArray[np.float32],
