@@ -12,16 +12,13 @@ are for choosing settings, odd seeds for reporting; the tables keep them apart.
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from metrics import Metric, to_json
+from metrics import Metric
+from seeds import run_seeds_as_script
 
 from boxplus.manifolds import so3
 from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation, SpinningLidar
@@ -145,29 +142,7 @@ def figures(lines: Sequence[dict[str, Any]]) -> list[Metric]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", default="0:28", help="first:last+1")
-    parser.add_argument("--half", choices=("even", "odd", "both"), default="both")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="write a line of JSON for every seed")
-    parser.add_argument("--json", type=Path, help="write the figures that a baseline holds")
-    parser.add_argument("-v", action="store_true", help="print these lines")
-    options = parser.parse_args(arguments)
-    begin, end = (int(part) for part in options.seeds.split(":"))
-    seeds = [s for s in range(begin, end) if options.half == "both" or s % 2 == ("even", "odd").index(options.half)]
-    if options.jobs > 1:
-        with ProcessPoolExecutor(options.jobs) as pool:
-            lines = list(pool.map(run_seed, seeds, chunksize=4))
-    else:
-        lines = [run_seed(seed) for seed in seeds]
-    if options.out:
-        options.out.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
-    if options.json:
-        options.json.write_text(json.dumps(to_json(figures(lines))), encoding="utf-8")
-    if options.v:
-        for line in lines:
-            print(json.dumps(line))
-    print(report(lines))
+    run_seeds_as_script(__doc__.splitlines()[0], run_seed, report, figures, seeds="0:28", arguments=arguments)
 
 
 if __name__ == "__main__":

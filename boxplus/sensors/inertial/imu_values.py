@@ -53,14 +53,14 @@ def glitches(imu: ImuSamples) -> NDArray[np.bool_]:
     before are from one another; the first nine are not judged. Of the last one only the sample before is known.
     """
     mask = np.zeros(len(imu), dtype=bool)
-    if len(imu) < 2 or not _any_far(imu.time_ns, imu.gyro, imu.accel):
+    if len(imu) < 2:
         return mask
     last_is_far = False
-    seconds = 1e-9 * np.diff(imu.time_ns)
+    steps, far = np.empty(len(imu) - 1), np.empty(len(imu) - 1, np.bool_)
     for values, (rate, least) in ((imu.gyro, _GLITCH_GYRO), (imu.accel, _GLITCH_ACCEL)):
-        steps = np.linalg.norm(np.diff(values, axis=0), axis=1)
-        far = steps > np.maximum(least, rate * seconds)
-        for k in np.flatnonzero(far):  # the step into sample k + 1; nearly always there is none
+        if not _steps_into(imu.time_ns, values, rate, least, steps, far):
+            continue
+        for k in np.flatnonzero(far):  # the step into sample k + 1
             before = steps[max(k - BEFORE, 0) : k]
             if mask[k] or len(before) < _FEWEST or not steps[k] > _USUAL * float(np.median(before)):
                 continue
@@ -74,16 +74,21 @@ def glitches(imu: ImuSamples) -> NDArray[np.bool_]:
 
 
 @kernel
-def _any_far(time_ns: NDArray[np.int64], gyro: NDArray[np.float64], accel: NDArray[np.float64]) -> bool:
-    """Whether any sample is far from the one before, by the rule of `glitches`: nearly always none is."""
-    for k in range(1, len(time_ns)):
-        seconds = 1e-9 * (time_ns[k] - time_ns[k - 1])
-        turned = pushed = 0.0
+def _steps_into(
+    time_ns: NDArray[np.int64],
+    values: NDArray[np.float64],
+    rate: float,
+    least: float,
+    steps: NDArray[np.float64],
+    far: NDArray[np.bool_],
+) -> bool:
+    """How far samples (n, 3) are from the one before, and where that is far (n - 1,); whether it is anywhere: nearly never."""
+    any_far = False
+    for k in range(len(steps)):
+        squared = 0.0
         for axis in range(3):
-            turned += (gyro[k, axis] - gyro[k - 1, axis]) ** 2
-            pushed += (accel[k, axis] - accel[k - 1, axis]) ** 2
-        if math.sqrt(turned) > max(_GLITCH_GYRO[1], _GLITCH_GYRO[0] * seconds):
-            return True
-        if math.sqrt(pushed) > max(_GLITCH_ACCEL[1], _GLITCH_ACCEL[0] * seconds):
-            return True
-    return False
+            squared += (values[k + 1, axis] - values[k, axis]) ** 2
+        steps[k] = math.sqrt(squared)
+        far[k] = steps[k] > max(least, rate * (1e-9 * (time_ns[k + 1] - time_ns[k])))
+        any_far |= far[k]
+    return any_far

@@ -52,20 +52,18 @@ class StuckSensor:
         enough_ns = round(_STUCK_S * 1e9) + time_ns[-1] - imu.time_ns[0]
         first = min(int(np.searchsorted(time_ns, time_ns[-1] - enough_ns)), len(time_ns) - _FEWEST - new) - _BEFORE
         self._time_ns, self._values = time_ns[max(first, 0) :], values[max(first, 0) :]
-        repeats = (values[-1] == values[-2]).tolist() if len(values) > 1 else []
-        if not (all(repeats[_GYRO]) or all(repeats[_ACCEL])):
+        begin = self._stuck_since(_GYRO, _ACCEL, _ACCEL_NOISE)
+        if begin is None:
             self._turns.clear()
-            return None  # as nearly always
-        if self._stopped():
+        elif self._stopped(begin):
             return self._sentence("gyroscope", "and went there from a turn within one of them")
-        if self._turns_alone(imu, turned, bias):
+        elif self._turns_alone(imu, turned, bias):
             return self._sentence("gyroscope", "although the scans turn")
         return self._sentence("accelerometer", "although the platform turns to and fro") if self._feels_nothing() else None
 
-    def _stopped(self) -> bool:
-        """Whether the gyroscope repeats itself since it stopped within a sample."""
-        begin = self._stuck_since(_GYRO, _ACCEL, _ACCEL_NOISE)
-        if begin is None or begin < _BEFORE:
+    def _stopped(self, begin: int) -> bool:
+        """Whether the gyroscope, which repeats itself since the sample `begin`, stopped within a sample."""
+        if begin < _BEFORE:
             return False
         steps = np.linalg.norm(self._values[begin - _BEFORE : begin, _GYRO] - self._values[begin, _GYRO], axis=1)
         # Samples that come in bursts may bear stamps that lie much closer than they were taken.
@@ -74,9 +72,6 @@ class StuckSensor:
 
     def _turns_alone(self, imu: ImuSamples, turned: NDArray[np.float64], bias: NDArray[np.float64]) -> bool:
         """Whether the scans turn and turn while the gyroscope repeats itself."""
-        if self._stuck_since(_GYRO, _ACCEL, _ACCEL_NOISE) is None:
-            self._turns.clear()
-            return False
         if not self._turns:
             self._bias = bias.copy()
         end_ns = int(imu.time_ns[-1])
