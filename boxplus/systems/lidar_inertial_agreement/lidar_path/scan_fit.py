@@ -74,7 +74,7 @@ class ScanFit:
         x: (36,) packed, the pose of the scan, axes of the path.
         rate, velocity: (3,) of the way to it, as those of `Standing`.
         information: (6, 6) of the pose [θ, p], nothing along weak directions.
-        weak: (6, n) these.
+        weak: whether there are any.
         misfit: rms of the points about their planes [m].
         cost: the same squared, with what points cost that lie on none [m²].
         map_points: (m, 3) float32, what the scan brings to the map, LiDAR frame.
@@ -84,7 +84,7 @@ class ScanFit:
     rate: NDArray[np.float64]
     velocity: NDArray[np.float64]
     information: NDArray[np.float64]
-    weak: NDArray[np.float64]
+    weak: bool
     misfit: float
     cost: float
     map_points: NDArray[np.float32]
@@ -222,7 +222,7 @@ class ScanFitter:
             rate=rate,
             velocity=velocity,
             information=known if held is None else with_held(known, held),
-            weak=directions.vectors[:, directions.weak],
+            weak=bool(directions.weak.any()),
             misfit=information.residual_rms,
             cost=information.residual_rms**2 * share + self.config.plane_threshold**2 * (1.0 - share),
             map_points=self.map_points(still),

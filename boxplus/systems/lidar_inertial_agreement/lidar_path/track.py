@@ -129,7 +129,7 @@ class Track:
     def _go_on(self, fit: ScanFit, tree: IkdTree, middle_ns: int) -> None:
         self._usual = fit.misfit if self._usual == 0.0 else 0.9 * self._usual + 0.1 * fit.misfit
         self._x, self._rate, self._velocity, self._tree = fit.x, fit.rate, fit.velocity, tree
-        self._keep(middle_ns, fit.information, bool(fit.weak.size), fit.misfit, fit.cost)
+        self._keep(middle_ns, fit.information, fit.weak, fit.misfit, fit.cost)
         self._tree.insert(NavState.unpack(fit.x).to_world(fit.map_points), downsample=True)
         self._previous_ns = middle_ns
 
