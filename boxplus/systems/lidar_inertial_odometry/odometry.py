@@ -40,15 +40,14 @@ from boxplus.systems.lidar_inertial_odometry.outcome import Outcome
 from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start.first_scan import deskew_first
-from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start
-from boxplus.systems.lidar_inertial_odometry.start.unstarted import UnstartedScans
+from boxplus.systems.lidar_inertial_odometry.start.search import StartSearch
+from boxplus.systems.lidar_inertial_odometry.start.start import Start
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
 from boxplus.systems.lidar_inertial_odometry.watches.long_baseline import LongBaseline
 from boxplus.systems.lidar_inertial_odometry.watches.weak_spell import WeakSpell
 from boxplus.systems.lidar_inertial_odometry.well_placed import well_placed
 
-_LONGEST_START_SCANS, _FEWEST_NEW = 30, 0.3  # scans that a start may take, share of them that is new in every try
 _BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS = 3, 8, 2
 _BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
@@ -80,14 +79,13 @@ class LidarInertialOdometry(Snapshots):
         self.start: Start | None = None
         self.start_problem: str | None = None  # why there was none sooner
         self._sequencer = Sequencer()
-        self._waiting: list[Frame] = []
-        self._next_try, self._time_ns = 0, 0  # scans that wait, and the instant of the state
+        self._search, self._time_ns = StartSearch(self.config), 0  # and the instant of the state
         self._voxel_filter = VoxelFilter(self.config.scan_voxel, self.config.max_points)
         self._box, self._excitation = SlidingBox(self.config.box_side, self.config.detection_range), RotationExcitation()
         self._standstill: Standstill | None = None
         self._unshown, self._weak_spell = UnshownMotion(), WeakSpell(self.config.weak_threshold)
         self._consistency, self._long_baseline = Consistency(self.config, live=self._live), LongBaseline(self.config)
-        self._saturation, self._unstarted = Saturation(), UnstartedScans(self.config)
+        self._saturation = Saturation()
         self._warnings: list[str] = []
         self._x_before: NDArray[np.float64] = np.zeros(0)
         self._motion: NDArray[np.float64] = np.zeros((2, 3))  # turn rate and velocity over the last scan
@@ -139,10 +137,11 @@ class LidarInertialOdometry(Snapshots):
     def flush(self) -> list[Estimate]:
         """No more data will come: process what still waits for IMU samples."""
         estimates = self._advance(self._sequencer.frames(flush=True))
-        if self.start is None and self._waiting:
+        if self.start is None and self._search.frames:
             estimates += self._try_start()
-            self._forget(len(self._waiting))
-            self.start_problem = self._unstarted.named(self.start_problem)
+            if self.start is None:
+                self._search.give_up()
+                self._note_search()
         self._consistency.finish()
         return estimates
 
@@ -169,15 +168,13 @@ class LidarInertialOdometry(Snapshots):
             if self.start is not None:
                 estimates.append(self._process(frame))
                 continue
-            self._waiting.append(frame)
-            seconds = (frame.scan.end_ns - self._waiting[0].scan.start_ns) * 1e-9
-            if seconds >= self.config.start_duration and len(self._waiting) >= self._next_try:
+            self._search.frames.append(frame)
+            if self._search.due:
                 estimates += self._try_start()
         return estimates
 
     def _interrupt(self, frame: Frame) -> Frame:
         """Nothing says how the platform moved since the last scan: back to the search for a start, with a new map."""
-        self._next_try = 0
         self._consistency.finish()
         self._gap = " ".join(filter(None, [self._gap, self._consistency.contradiction, gap_text(frame.duration_s)]))
         self._consistency, self._long_baseline = Consistency(self.config, live=self._live), LongBaseline(self.config)
@@ -188,17 +185,13 @@ class LidarInertialOdometry(Snapshots):
 
     def _try_start(self) -> list[Estimate]:
         """Find the first state, then process every scan that waited for it, but for those before it."""
-        found = find_start(self._waiting, self.config)
-        if isinstance(found, str):
-            self.start_problem = found
-            # The oldest scans make room, so that a start that takes long stays cheap.
-            self._forget(len(self._waiting) - _LONGEST_START_SCANS)
-            self._next_try = len(self._waiting) + 1 + int(_FEWEST_NEW * len(self._waiting))
+        found = self._search.find()
+        self._note_search()
+        if found is None:
             return []
         if self._gap is not None:
             found = replace(found, state=replace(found.state, p_world_imu=self._x[P : P + 3].copy()))
-        self._forget(sum(frame.scan.end_ns < found.time_ns for frame in self._waiting))
-        self.start, self._unstarted = found, UnstartedScans(self.config)
+        self.start, (first, *rest), self._search = found, self._search.frames, StartSearch(self.config)
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
         self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
         known = self._cov if self.config.extrinsic_estimation == "off" else mounting_known(self._cov)[0]
@@ -208,17 +201,16 @@ class LidarInertialOdometry(Snapshots):
         self._unshown = UnshownMotion(found.unshown_axes, found.time_ns, found.state.p_world_imu, found.doubted)
         self._weak_spell = WeakSpell(self.config.weak_threshold, None if len(found.unshown_axes) else found.time_ns)
         if found.kind == "static":
-            self._standstill = Standstill(joined_imu(self._waiting), found.state.p_world_imu)
-        (first, *rest), self._waiting = self._waiting, []
+            self._standstill = Standstill(joined_imu([first, *rest]), found.state.p_world_imu)
         p_lidar = deskew_first(first, found.state, self.config)
         self._insert(found.state.to_world(self._thinned(p_lidar)[1]))
         self._warnings = [text for text in (self._gap, found.warning) if text]
         return [self._estimate(first, p_lidar), *self._advance(rest)]
 
-    def _forget(self, oldest: int) -> None:
-        """Scans that no start will begin with."""
-        self._sequencer.rejected[AFTER_GAP if self._gap else BEFORE_START] += self._unstarted.add(self._waiting[: max(oldest, 0)])
-        del self._waiting[: max(oldest, 0)]
+    def _note_search(self) -> None:
+        """Scans that no start will begin with, and why."""
+        self._sequencer.rejected[AFTER_GAP if self._gap else BEFORE_START] += self._search.forgotten
+        self._search.forgotten, self.start_problem = 0, self._search.problem or self.start_problem
 
     def _process(self, frame: Frame) -> Estimate:
         """One scan, line by line as in docs/lidar_inertial_odometry.md."""

@@ -22,6 +22,39 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.track import Track
 _FOLLOWED = 5  # poses of a track, the first two included, after which the others that began with it are given up
 
 
+class GrowingPath:
+    """The path of the LiDAR through scans as they come, in order of time; arguments as for `lidar_path`."""
+
+    def __init__(
+        self,
+        config: RegistrationConfig,
+        guesses: Sequence[Turning] = (),
+        *,
+        undistort: bool = False,
+        velocity: NDArray[np.float64] | None = None,
+        held: bool = False,
+    ) -> None:
+        self._tracks = [Track(config, guesses, undistort=undistort, velocity=velocity, held=held)]
+
+    @property
+    def failed(self) -> int:
+        """Scans that could not be registered so far."""
+        return self._tracks[0].failed
+
+    def path(self) -> LidarPath:
+        """Through all scans so far."""
+        return self._tracks[0].path()
+
+    def turn_by(self, guesses: Sequence[Turning]) -> None:
+        """How the LiDAR may turn from now on, where more has come to be known of it."""
+        for track in self._tracks:
+            track.turn_by(guesses)
+
+    def add(self, scan: Scan, expected: Twist | None = None) -> None:
+        """Register the next scan; `expected` is one more start."""
+        self._tracks = _worth_following([one for track in self._tracks for one in track.add(scan, expected)])
+
+
 def lidar_path(
     scans: Iterable[Scan],
     config: RegistrationConfig,
@@ -45,13 +78,12 @@ def lidar_path(
         held: whether the LiDAR moves as far along its way as is expected, whatever the scan says of that (`common_motion`).
         unbroken: whether to stop at the first scan that cannot be registered: the most costly one, as all starts are tried.
     """
-    tracks = [Track(config, guesses, undistort=undistort, velocity=velocity, held=held)]
+    growing = GrowingPath(config, guesses, undistort=undistort, velocity=velocity, held=held)
     for number, scan in enumerate(scans):
-        tracks = [one for track in tracks for one in track.add(scan, None if expected is None else expected[number])]
-        tracks = _worth_following(tracks)
-        if unbroken and tracks[0].failed:
+        growing.add(scan, None if expected is None else expected[number])
+        if unbroken and growing.failed:
             break
-    return tracks[0].path()
+    return growing.path()
 
 
 def _worth_following(tracks: list[Track]) -> list[Track]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import GrowingPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
 
@@ -21,6 +21,7 @@ _SURE_M = 0.006  # standard deviation of a pose, along all axes, below which no 
 _APART_M_S = 1.0, 2.0  # both ways along the two axes that are known least
 _DEVIATIONS, _ANOTHER_M_S = 5.0, 0.3  # beyond both another speed is another
 _AS_WELL = 1.1  # times the cost
+_JOINED_STEPS, _JOINED_M_S = 5, 0.1  # in a row
 _ONE_M_S, _ONE_SHARE = 1.0, 0.05  # two speeds are one
 
 
@@ -72,12 +73,45 @@ def other_speed(
     velocity = mean_velocity(path)
     for away in _APART_M_S:
         for axis in (axes[:, 0], -axes[:, 0], axes[:, 1], -axes[:, 1]):
-            start = velocity + away * axis
-            other = lidar_path(scans, config, guesses, undistort=True, velocity=start, unbroken=True)
-            if other.failed or len(other) != len(path):
+            other = _path_at(velocity + away * axis, path, scans, config, guesses)
+            if other is None:
                 continue
             apart = other.p_path_lidar[-1] - path.p_path_lidar[-1]
             sure = apart @ path.information[-1, 3:, 3:] @ apart > _DEVIATIONS**2
-            if sure and np.linalg.norm(apart) > _ANOTHER_M_S * seconds and other.cost.sum() < _AS_WELL * path.cost.sum():
+            if sure and np.linalg.norm(apart) > _ANOTHER_M_S * seconds:
                 return mean_velocity(other)
     return None
+
+
+def _path_at(
+    velocity: NDArray[np.float64],
+    path: LidarPath,
+    scans: Sequence[Scan],
+    config: RegistrationConfig,
+    guesses: Sequence[Turning],
+) -> LidarPath | None:
+    """The path through the same scans that begins with another velocity (3,), where it fits about as well and stays another.
+
+    It ends as soon as that is decided: what it costs only grows, and one that moves as the other does will not leave it any more.
+    """
+    growing = GrowingPath(config, guesses, undistort=True, velocity=velocity)
+    most = _AS_WELL * float(path.cost.sum())
+    for scan in scans:
+        growing.add(scan)
+        other = growing.path()
+        if growing.failed or float(other.cost.sum()) > most or _has_joined(other, path):
+            return None
+    return other if len(other) == len(path) else None
+
+
+def _has_joined(other: LidarPath, path: LidarPath) -> bool:
+    """Whether a path has, over its last steps, moved as the other through the same scans did, and will not end far from it."""
+    last = len(other) - 1
+    if last < _JOINED_STEPS or last >= len(path):
+        return False
+    steps = slice(last - _JOINED_STEPS, last + 1)
+    apart = other.p_path_lidar[steps] - path.p_path_lidar[steps]
+    faster = np.diff(apart, axis=0) / (np.diff(path.time_ns[steps])[:, None] * 1e-9)
+    seconds, left = (path.time_ns[-1] - path.time_ns[[0, last]]) * 1e-9
+    near = float(np.linalg.norm(apart[-1])) + _JOINED_M_S * left < _ANOTHER_M_S * seconds
+    return near and bool(np.linalg.norm(faster, axis=1).max() < _JOINED_M_S)

@@ -96,7 +96,7 @@ class ScanFitter:
     def __init__(self, config: RegistrationConfig, guesses: Sequence[Turning], *, undistort: bool, held: bool) -> None:
         self.config = config.model_copy(update={"weak_threshold": min(config.weak_threshold, _WEAK)})
         self._of_few = self.config.model_copy(update={"min_points": max(config.min_points, FEWEST_USED)})
-        self._guesses = tuple(guesses)
+        self.guesses = tuple(guesses)
         self._undistort, self._held = undistort and bool(guesses), held
         self._filter = VoxelFilter(max(config.scan_voxel, config.map_cell), MOST_POINTS)
         self._map_filter = VoxelFilter(config.map_cell, MOST_MAP_POINTS)
@@ -122,7 +122,7 @@ class ScanFitter:
     def turning(self, middle_ns: int, step_s: float) -> list[NDArray[np.float64]]:
         """The turn rates (3,) [rad/s] of the guesses on the way to a scan."""
         rates = []
-        for guess in self._guesses:
+        for guess in self.guesses:
             R_guess = guess(np.array([middle_ns - round(step_s * 1e9), middle_ns]))
             rates.append(so3.log(R_guess[0].T @ R_guess[1]) / step_s)
         return rates
@@ -242,7 +242,7 @@ class ScanFitter:
         return directions
 
     def _nodes(self, scan: Scan, at_ns: int, rate: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
-        return nodes_within(scan, at_ns, rate, velocity, self._guesses[0] if self._undistort else None)
+        return nodes_within(scan, at_ns, rate, velocity, self.guesses[0] if self._undistort else None)
 
 
 def _same_pose(x: NDArray[np.float64], y: NDArray[np.float64]) -> bool:

@@ -86,6 +86,10 @@ class Track:
         """What they have cost."""
         return sum(pose.cost for pose in self._poses if pose.segment == self._segment)
 
+    def turn_by(self, guesses: Sequence[Turning]) -> None:
+        """How the LiDAR may turn from now on."""
+        self._fitter.guesses = tuple(guesses)
+
     def add(self, scan: Scan, expected: Twist | None = None) -> list[Track]:
         """Register the next scan; `expected` is one more start. Returns itself, and others where it may go on otherwise."""
         if len(scan) < self._fitter.config.min_points:

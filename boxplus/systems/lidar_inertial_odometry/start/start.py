@@ -16,7 +16,6 @@ from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import speaks_against
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
     least_known_axis,
     mean_velocity,
@@ -40,6 +39,7 @@ from boxplus.systems.lidar_inertial_odometry.start.changes import (
     weighed_rest,
 )
 from boxplus.systems.lidar_inertial_odometry.start.first_state import gyro_bias, moving_fit, moving_state, static_state
+from boxplus.systems.lidar_inertial_odometry.start.grown_paths import GrownPaths
 
 _REST_ACCEL_NORM = (9.0, 10.6)  # m/s²
 _NO_GRAVITY = 0.5  # m/s²: less on average than any start but free fall
@@ -88,7 +88,7 @@ class Start:
     doubted: bool = False
 
 
-def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
+def find_start(frames: Sequence[Frame], config: LioConfig, grown: GrownPaths | None = None) -> Start | str:
     """Decide between the static and the moving start over `frames`; a sentence when neither is possible yet.
 
     At rest means that the LiDAR does not move against what it sees, however much the IMU is shaken; only along what the scene
@@ -96,50 +96,62 @@ def find_start(frames: Sequence[Frame], config: LioConfig) -> Start | str:
     accelerometer. A path that has once gone astray stays so: where there is no start over all scans, it is sought over the
     newest of them, and `Start.time_ns` says with which scan it begins.
 
+    Args:
+        frames: consecutive scans with the IMU samples around them.
+        config: of the odometry.
+        grown: paths of the tries before with these scans, which go on.
+
     Raises:
         InputError: the accelerometer reports in g, was taken for one that does, or shows no gravity.
     """
     seen = Beginning(frames, config)
     _check_accelerometer(seen.accel_norm)
+    grown = GrownPaths() if grown is None else grown
     try:
-        return _start(seen)
+        return _start(seen, grown)
     except NotYet as reason:
         refusal = str(reason)
-    newest = _newest(frames, config.start_duration)
-    if len(newest) < _MUCH_SHORTER * len(frames):
+    newest = _newest(frames, config.start_duration, grown)
+    if newest:
         try:
-            return _start(Beginning(newest, config))
+            return _start(Beginning(newest, config), grown)
         except NotYet:
             pass
     return refusal
 
 
-def _start(seen: Beginning) -> Start:
+def _start(seen: Beginning, grown: GrownPaths) -> Start:
     """The start that fits all that has been seen."""
-    path = lidar_path(seen.scans, seen.registration, seen.guesses, unbroken=True)
+    path = grown.through(seen)
     motion = following_changes(seen, path)
     if motion is not None and not motion.shown:
-        return _moving_start(seen, held_path(seen, seen.guesses, motion.twists), motion)
+        return _moving_start(seen, held_path(seen, seen.guesses, motion.twists), grown, motion)
     _check_path(seen, path)
     rest = judge_rest(path, seen.scans, seen.registration)
     seen.note(rest)
     _check_gyroscope(seen, path, rest)
     if not rest.at_rest or motion is not None:  # along what the scene leaves open, what changes may show a motion
-        return _moving_start(seen, path, motion)
+        return _moving_start(seen, path, grown, motion)
     rest, doubt = weighed_rest(seen, path, rest)
     if rest.determined or seen.imu_is_quiet(rest):
         return _static_start(seen, rest, doubt)
     axes = seen.level(rest.open_axes)
     if len(axes):
         raise NotYet(f"{undecided(axes)}, and the IMU is not quiet ({seen.evidence}){WAITING}")
-    return _moving_start(seen, path, motion)
+    return _moving_start(seen, path, grown, motion)
 
 
-def _newest(frames: Sequence[Frame], seconds: float) -> Sequence[Frame]:
-    """The last frames, just enough of them for a start."""
+def _newest(frames: Sequence[Frame], seconds: float, grown: GrownPaths) -> Sequence[Frame]:
+    """Much fewer than all of the frames, enough of them for a start; none where there are no fewer.
+
+    From where a path goes on; where none does, just enough of them.
+    """
     times = np.array([frame.scan.start_ns for frame in frames])
     enough = int(np.searchsorted(times, frames[-1].scan.end_ns - round(seconds * 1e9), side="right")) - 1
-    return frames[max(min(enough, len(frames) - _MIN_MOVING_SCANS), 0) :]
+    latest = min(enough, len(frames) - _MIN_MOVING_SCANS)
+    much_later = range(int((1.0 - _MUCH_SHORTER) * len(frames)) + 1, latest + 1)
+    begun = [k for k in much_later if grown.unbroken_from(frames[k].scan)]
+    return frames[begun[0] :] if begun else frames[latest:] if latest in much_later else []
 
 
 def _check_accelerometer(norm: float) -> None:
@@ -229,16 +241,19 @@ def _static_start(seen: Beginning, rest: Rest, doubt: str) -> Start:
     )
 
 
-def _moving_start(seen: Beginning, path: LidarPath, motion: Common | None = None, follow: bool = False) -> Start:
+def _moving_start(
+    seen: Beginning, path: LidarPath, grown: GrownPaths, motion: Common | None = None, follow: bool = False
+) -> Start:
     """The start of a platform in motion, on a path that follows `motion` where that and not the registrations show its speed."""
     if len(seen.frames) < _MIN_MOVING_SCANS:
         raise seen.not_moving(f"{len(seen.frames)} scans are not enough for a moving start")
     # Once more, each scan undistorted with the gyroscope instead of a constant rate.
     imu, scans = seen.imu, seen.scans
-    steady = ImuSamples(imu.time_ns, imu.gyro - gyro_bias(path, imu, seen.extrinsic), imu.accel)
+    bias = gyro_bias(path, imu, seen.extrinsic)
+    steady = ImuSamples(imu.time_ns, imu.gyro - bias, imu.accel)
     guesses, first = gyro_guesses(steady, seen.extrinsic.R_imu_lidar), path
     if not follow:
-        path = lidar_path(scans, seen.registration, guesses, undistort=True, velocity=mean_velocity(first, _FIRST), unbroken=True)
+        path = grown.steady(seen, bias, mean_velocity(first, _FIRST))
         follow = motion is not None and (broken(path) or not one_speed(path, first))
     if motion is not None and follow:
         path = held_path(seen, guesses, motion.twists)
@@ -265,7 +280,7 @@ def _moving_start(seen: Beginning, path: LidarPath, motion: Common | None = None
     speed = float(np.linalg.norm(state.v_world_imu))
     other = other_speed(path, scans, seen.registration, guesses) if not follow else None
     if other is not None and motion is not None:
-        return _moving_start(seen, first, motion, follow=True)
+        return _moving_start(seen, first, grown, motion, follow=True)
     if other is not None:
         raise seen.not_moving(
             "the surroundings do not show how fast the platform moves: the scans fit about as "
