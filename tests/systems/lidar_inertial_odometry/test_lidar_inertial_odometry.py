@@ -19,6 +19,8 @@ from boxplus.simulation import Simulation
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from boxplus.systems.lidar_inertial_odometry.start.grown_paths import GrownPaths
+from boxplus.systems.lidar_inertial_odometry.start.search import StartSearch
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start
 from tests.systems.lidar_inertial_odometry.small_drives import config, position_errors, room_walk, run
 
@@ -130,11 +132,11 @@ def test_why_there_was_no_start_sooner_is_kept(
 ) -> None:
     tries: list[int] = []
 
-    def refused_once(frames: Sequence[Frame], settings: LioConfig) -> Start | str:
+    def refused_once(frames: Sequence[Frame], settings: LioConfig, grown: GrownPaths) -> Start | str:
         tries.append(len(frames))
-        return find_start(frames, settings) if len(tries) > 1 else "a wall says little"
+        return find_start(frames, settings, grown) if len(tries) > 1 else "a wall says little"
 
-    monkeypatch.setattr(f"{LidarInertialOdometry.__module__}.find_start", refused_once)
+    monkeypatch.setattr(f"{StartSearch.__module__}.find_start", refused_once)
     odometry = LidarInertialOdometry(config(room))
     assert run(odometry, events) and odometry.start is not None
     assert odometry.start_problem == "a wall says little"

@@ -115,8 +115,9 @@ def find_start(frames: Sequence[Frame], config: LioConfig, grown: GrownPaths | N
     if newest:
         try:
             return _start(Beginning(newest, config), grown)
-        except NotYet:
-            pass
+        except NotYet as reason:
+            if not grown.unbroken_from(frames[0].scan):  # then that says nothing of the newest
+                refusal = str(reason)
     return refusal
 
 
