@@ -6,7 +6,7 @@ while running ask the same question. It is answered once:
     path         how the LiDAR moved, from its scans alone
     rotation     against the gyroscope: mounting, clocks, unit, sign
     translation  against the accelerometer: gravity, velocity, bias, lever arm, sign and scale
-    planes       against gravity: how far what stands around is from upright
+    planes       against gravity: how far what stands around is from upright, and the ground from level
 
 Each with a covariance, so that what the motion does not show is left open. See docs/agreement.md.
 """
@@ -27,13 +27,15 @@ from boxplus.sensors.inertial.imu_values import beyond, empty, finite, glitches
 from boxplus.sensors.lidar.scan import Scan, in_order
 from boxplus.systems.lidar_inertial_agreement.corrected_points import CorrectedPoints, corrected_points
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
+from boxplus.systems.lidar_inertial_agreement.ground_lean import GroundLean, drives, ground_lean
 from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import surer_path
-from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
+from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import expected_path, explained_scans
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, with_cells_for_all
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
 from boxplus.systems.lidar_inertial_agreement.rotation import SCALE, RotationFit, compare_rotations
+from boxplus.systems.lidar_inertial_agreement.surroundings import surroundings_of
 from boxplus.systems.lidar_inertial_agreement.translation import SLOPE, TranslationFit, compare_accelerations, wide_prior
 
 _EXPLAINED = 0.8  # of the LiDAR's rotation, before the gyroscope may help to undistort
@@ -72,6 +74,7 @@ class Agreement:
         gyro_power: mean square of the gyroscope's rates, averaged as between two scans, about their mean [(rad/s)²], in its own
             unit.
         planes: how upright the surroundings are under the declared mounting; None where none was declared, or nothing shows it.
+        ground: how far the ground leans that the LiDAR was driven along, likewise.
         in_feet: the accelerations again with the points taken for feet; None where they are not as thick as feet would be.
         astray: that the motion an estimator expected is not the one its scans show; None where it is, or none was given.
         corrected: that the points were corrected for motion before they were recorded; None where nothing shows it.
@@ -84,6 +87,7 @@ class Agreement:
     imu_rate_hz: float
     gyro_power: float
     planes: PlaneTilt | None = None
+    ground: GroundLean | None = None
     in_feet: TranslationFit | None = None
     astray: Finding | None = None
     corrected: CorrectedPoints | None = None
@@ -147,11 +151,9 @@ def _compare(
     elif _turns_off(found.rotation):
         surer = surer_path(path, scans, config, guesses) or path
     if surer is None:
-        # Planes lean as they do however far the LiDAR went past them.
-        planes = None
         if T_declared is not None and explained is not None and explained.turns_alike:
-            planes = plane_tilt(path, scans, imu, T_declared[:3, :3], config)
-        return replace(found, rotation=None, translation=None, astray=astray, planes=planes)
+            found = _with_planes(found, path, scans, imu, T_declared, config, expected)
+        return replace(found, rotation=None, translation=None, astray=astray)
     if surer is not path:
         found = _compared(surer, imu, T_guess, T_declared)
     # Undistorted at constant rates, a fast turn bends the path by as much as a wrong scale.
@@ -171,11 +173,32 @@ def _compare(
         # The gyroscope agreed with the first path: where it does not agree with the second, that has gone astray.
         if again.rotation is not None and again.rotation.explained > _EXPLAINED:
             found = again
-    planes = None
     if T_declared is not None and found.rotation is not None:
-        planes = plane_tilt(found.path, scans, imu, T_declared[:3, :3], config)
+        found = _with_planes(found, found.path, scans, imu, T_declared, config, expected)
     before = corrected_points(found.path, found.rotation, scans, imu, config, guesses)
-    return replace(found, planes=planes, astray=astray, corrected=before)
+    return replace(found, astray=astray, corrected=before)
+
+
+def _with_planes(
+    found: Agreement,
+    path: LidarPath,
+    scans: Sequence[Scan],
+    imu: ImuSamples,
+    T_declared: NDArray[np.float64],
+    config: RegistrationConfig,
+    expected: Sequence[Twist] | None,
+) -> Agreement:
+    """With what planes say of gravity: they lean as they do however far the LiDAR went past them.
+
+    But only what drives has a road, and a path may rest with the pattern of a LiDAR, or speed up with it: of an estimator it is
+    asked what leans under the motion that it believes in.
+    """
+    around = surroundings_of(path, scans, imu, T_declared[:3, :3], config)
+    planes = None if around is None else plane_tilt(around)
+    if expected is not None:
+        path = expected_path(path, scans, expected)
+        around = surroundings_of(path, scans, imu, T_declared[:3, :3], config) if drives(path) else None
+    return replace(found, planes=planes, ground=None if around is None else ground_lean(around))
 
 
 def _as_thick_as_feet(found: Agreement) -> bool:

@@ -20,6 +20,7 @@ from boxplus.systems.lidar_inertial_agreement.agreement import (
     unit_of,
 )
 from boxplus.systems.lidar_inertial_agreement.finding import Cause, Finding
+from boxplus.systems.lidar_inertial_agreement.leaning import leaning
 from boxplus.systems.lidar_inertial_agreement.lengths import (
     MISFIT_M,
     SLOPE_FLOOR,
@@ -27,7 +28,6 @@ from boxplus.systems.lidar_inertial_agreement.lengths import (
     feet_finding,
     slope_finding,
 )
-from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit
 from boxplus.systems.lidar_inertial_agreement.translation import TURN, TranslationFit
 
@@ -49,11 +49,8 @@ _FEWEST_POSES = 15  # compared, for lengths: of ten or eleven the errors that ne
 _HALF_TURN_RAD = np.deg2rad(12.0)
 _TURN_KNOWN_RAD, _TURN_OFF_RAD = np.deg2rad(3.0), np.deg2rad(6.0)
 _TURN_OPEN_RAD = np.deg2rad(15.0)
-_UPRIGHT_RAD = np.deg2rad(4.0)  # what an accelerometer's bias of 0.7 m/s² tilts
 _MUCH_NEARER = 0.5  # of the angle to the given mounting is left to its inverse, where that was meant
 _MOUNTED = 0.95  # share of the turning that a mounting explains
-_MIRRORS_RAD, _MIRRORS_SHARE = np.deg2rad(1.5), 0.2  # the tilt that a mirrored axis leaves, and its share of the tilt without
-_MIRRORED_RAD, _NEARLY_ALL = np.deg2rad(2.5), 0.12  # a tilt of which a mirrored axis leaves so little is hardly a bias
 
 
 def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None) -> list[Finding]:
@@ -65,7 +62,7 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
     """
     rotation, translation = agreement.rotation, agreement.translation
     if rotation is None:
-        planes = _of_planes(agreement)
+        planes = leaning(agreement.planes, agreement.ground)
         return [] if planes is None else [planes]
     if not _path_counts(agreement):
         return []
@@ -85,7 +82,7 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
         findings.append(_of_lengths(agreement, translation, T_declared))
         findings.append(_of_turn(rotation, translation, T_declared))
     if findings[0] is None and not shows_mounting(agreement):
-        findings.append(_of_planes(agreement))
+        findings.append(leaning(agreement.planes, agreement.ground))
     return [finding for finding in findings if finding is not None]
 
 
@@ -288,32 +285,6 @@ def _of_turn(rotation: RotationFit, translation: TranslationFit, T_declared: NDA
         f"accelerometer and LiDAR accelerate in directions {np.degrees(angle):.0f} deg apart under the given T_imu_lidar: check "
         "it, and that the topics are those of this mounting",
     )
-
-
-def _of_planes(agreement: Agreement) -> Finding | None:
-    """Where no motion shows the mounting, gravity does, if what stands around stands upright."""
-    planes = agreement.planes
-    if planes is None or planes.tilt < _least_tilt(planes):
-        return None
-    text = (
-        f"{'three' if planes.directions == 3 else 'two'} directions of planes, orthogonal to each other, are "
-        f"{np.degrees(planes.tilt):.0f} deg from upright by the accelerometer under the given T_imu_lidar: "
-    )
-    axis = int(np.argmin(planes.mirrored))
-    if planes.mirrored[axis] < min(_MIRRORS_RAD, _MIRRORS_SHARE * planes.tilt):
-        text += f"with {'xyz'[axis]} of the points mirrored they are upright; else "
-    advice = "check T_imu_lidar, and that the topics are those of this mounting, unless the place itself is tilted"
-    return Finding("extrinsic", text + advice)
-
-
-def _least_tilt(planes: PlaneTilt) -> float:
-    """The tilt that contradicts a mounting [rad].
-
-    A bias of the accelerometer tilts the world anyhow. That one of three axes, given the other sign, takes seven eighths of the
-    tilt away happens by chance once in twenty times, so that less of a tilt will do.
-    """
-    mirrored = planes.directions == 3 and float(planes.mirrored.min()) < _NEARLY_ALL * planes.tilt
-    return float(_MIRRORED_RAD if mirrored else _UPRIGHT_RAD) + 3.0 * planes.std
 
 
 def _of_scale(rotation: RotationFit) -> Finding | None:

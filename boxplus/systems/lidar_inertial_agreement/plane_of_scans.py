@@ -20,7 +20,7 @@ from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import middle_of
-from boxplus.systems.lidar_inertial_agreement.plane_tilt import plane_directions, plane_normals
+from boxplus.systems.lidar_inertial_agreement.surroundings import planar_points, plane_directions
 
 _SCANS, _MOST_POINTS = 10, 5000
 _FEWEST_SCANS, _FEWEST_SAMPLES = 3, 10
@@ -123,7 +123,7 @@ def _main_plane(scan: Scan, config: RegistrationConfig) -> NDArray[np.float64] |
         return None
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     tree.insert(points, downsample=True)
-    return next((axis for axis, share in plane_directions(plane_normals(tree)) if share > _MOST), None)
+    return next((axis for axis, share in plane_directions(planar_points(tree)[1]) if share > _MOST), None)
 
 
 def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from boxplus.simulation.faults import Event
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.scenarios import mounting
 from boxplus.simulation.worlds import worlds
-from boxplus.systems.lidar_inertial_agreement.lidar_path.path import Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 CONFIG = LioConfig()  # type: ignore[call-arg]
@@ -64,6 +64,14 @@ def true_poses(simulation: Simulation, time_ns: np.ndarray) -> tuple[np.ndarray,
     motion, T = simulation.ground_truth(time_ns), simulation.T_imu_lidar
     R = motion.R_world_imu @ T[:3, :3]
     return R, motion.p_world_imu + motion.R_world_imu @ T[:3, 3]
+
+
+def true_path(simulation: Simulation, scans: list[Scan]) -> LidarPath:
+    time_ns = np.array([(scan.start_ns + scan.end_ns) // 2 for scan in scans])
+    R, p = true_poses(simulation, time_ns)
+    K = len(scans)
+    flags, zeros = np.zeros(K, dtype=bool), np.zeros(K, dtype=np.int64)
+    return LidarPath(time_ns, R, p, np.tile(1e6 * np.eye(6), (K, 1, 1)), zeros, flags, np.zeros(K), np.zeros(K), 0)
 
 
 def true_twists(simulation: Simulation, scans: list[Scan], factor: float = 1.0) -> list[Twist]:

@@ -19,6 +19,7 @@ from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
+from boxplus.systems.lidar_inertial_agreement.surroundings import surroundings_of
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data
@@ -40,7 +41,8 @@ def straight(
 
 def tilt_of(simulation: Simulation, T: NDArray[np.float64], fault: Fault | None = None) -> PlaneTilt | None:
     scans, imu = data(simulation, fault)
-    return plane_tilt(lidar_path(scans, CONFIG), scans, imu, T[:3, :3], CONFIG)
+    around = surroundings_of(lidar_path(scans, CONFIG), scans, imu, T[:3, :3], CONFIG)
+    return None if around is None else plane_tilt(around)
 
 
 def leaning(simulation: Simulation, axis: tuple[float, float, float], degrees: float) -> NDArray[np.float64]:
@@ -114,7 +116,9 @@ def test_a_path_that_went_astray_contradicts_nothing() -> None:
     path = lidar_path(scans, CONFIG)
     seconds = (path.time_ns - path.time_ns[0]) * 1e-9
     slowed = path.p_path_lidar + np.outer(np.where(seconds < 1.0, 3.0 * seconds, 3.0), [1.0, 0.0, 0.0])
-    found = plane_tilt(replace(path, p_path_lidar=slowed), scans, imu, simulation.T_imu_lidar[:3, :3], CONFIG)
+    around = surroundings_of(replace(path, p_path_lidar=slowed), scans, imu, simulation.T_imu_lidar[:3, :3], CONFIG)
+    assert around is not None
+    found = plane_tilt(around)
     assert found is None or found.tilt < 3.0 * found.std
 
 

@@ -10,7 +10,7 @@ explains them clearly worse, and which is somewhere else by the end, has gone as
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +86,23 @@ def explained_scans(path: LidarPath, scans: Sequence[Scan], expected: Sequence[T
             if not explains_changes(chosen, turning_through(other[0], other[1], np.array([rate for rate, _ in twists])), twists):
                 astray = _astray(part.poses, other, more_off)
     return Explained(by_path, astray, turns_alike)
+
+
+def expected_path(path: LidarPath, scans: Sequence[Scan], expected: Sequence[Twist]) -> LidarPath:
+    """The last segment of a path, with its poses where an estimator believes that the LiDAR was.
+
+    Args:
+        path, scans, expected: as for `explained_scans`.
+    """
+    if not len(path):
+        return path
+    part = path.part(path.segment == path.segment[-1])
+    time_ns, R, p = _reckoned(scans, expected)
+    numbers = np.searchsorted(time_ns, [scan.end_ns for scan in scans_of(part.time_ns, scans)])
+    back = ((time_ns[numbers] - part.time_ns) * 1e-9)[:, None]
+    rate, velocity = (np.array([expected[number][which] for number in numbers]) for which in (0, 1))
+    moved = p[numbers] - back * np.einsum("kij,kj->ki", R[numbers], velocity)
+    return replace(part, R_path_lidar=R[numbers] @ so3.exp(-back * rate), p_path_lidar=moved)
 
 
 def _astray(own: Poses, other: Poses, more_off: float) -> Finding:

@@ -15,12 +15,12 @@ from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import lidar_path_backwards, surer_path
-from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
+from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import expected_path, explained_scans
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for_all
 from boxplus.systems.lidar_inertial_agreement.rotation import compare_rotations
-from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, true_poses, true_twists
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, true_path, true_twists
 
 COLUMNS = SpinningLidar(channels=64, azimuth_steps=62, vertical_fov_deg=(-45.0, 45.0))
 """Its columns lie six degrees apart: at ten metres a metre, along a column a sixth of that."""
@@ -34,19 +34,24 @@ def crossing() -> tuple[Simulation, list[Scan]]:
     return simulation, data(simulation)[0]
 
 
-def true_path(simulation: Simulation, scans: list[Scan]) -> LidarPath:
-    time_ns = np.array([(scan.start_ns + scan.end_ns) // 2 for scan in scans])
-    R, p = true_poses(simulation, time_ns)
-    K = len(scans)
-    flags, zeros = np.zeros(K, dtype=bool), np.zeros(K, dtype=np.int64)
-    return LidarPath(time_ns, R, p, np.tile(1e6 * np.eye(6), (K, 1, 1)), zeros, flags, np.zeros(K), np.zeros(K), 0)
-
-
 def frozen(path: LidarPath) -> LidarPath:
     """A path that has not left its first pose."""
     K = len(path)
     R, p = np.tile(path.R_path_lidar[:1], (K, 1, 1)), np.tile(path.p_path_lidar[:1], (K, 1))
     return LidarPath(path.time_ns, R, p, path.information, path.segment, path.weak, path.misfit, path.cost, path.failed)
+
+
+def test_an_expected_path_is_where_the_estimator_believes_that_the_lidar_was() -> None:
+    simulation, scans = crossing()
+    path = true_path(simulation, scans)
+    found = expected_path(frozen(path), scans, true_twists(simulation, scans))
+    moved = found.p_path_lidar - found.p_path_lidar[0]
+    R = path.R_path_lidar[0]
+    np.testing.assert_allclose(moved, (path.p_path_lidar - path.p_path_lidar[0]) @ R, atol=1e-6)
+    np.testing.assert_allclose(found.R_path_lidar, R.T @ path.R_path_lidar, atol=1e-9)
+    assert np.array_equal(found.time_ns, path.time_ns)
+    none = path.part(np.zeros(len(path), dtype=bool))
+    assert len(expected_path(none, scans, true_twists(simulation, scans))) == 0
 
 
 def test_a_path_that_stays_while_the_platform_moves_explains_less() -> None:
