@@ -36,8 +36,7 @@ _NOISY = 3.0  # times what noise makes of it
 _GONE = 0.4  # of a step, what another datum leaves of it
 _LESS, _FEWER = 0.8, 0.75  # or so much of it, where of the fixes that fit nothing no more than such a share is left
 _HALF = 0.5  # of the fixes that fit nothing, what another datum leaves where it is what they are of
-_SEEN = 12.0  # by which a step or burst there lowers the cost at least: less is made by noise and by what the odometry drifts
-_TRIED = 4  # steps, the largest first
+_TRIED = 4  # steps that are seen, the largest first
 _BESIDE = 2  # fixes, by which a step may be off
 _LASTING = 30.0  # s: multipath lasts less, and is no datum
 _SIDE_USED = 0.5  # of the fixes on the short side of a step, for the map to be bent by them
@@ -84,7 +83,7 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
     noise = np.sqrt(float(np.median(attached.sigma)) ** 2 * 2.0 / _WINDOW + of_odometry[_WINDOW:] + of_odometry[:-_WINDOW])
     least = np.maximum(_STANDS_OUT * float(np.median(steps)), _NOISY * noise)
     left = np.where(is_near & enough & (steps >= least), steps, 0.0)
-    sigma = float(np.median(attached.sigma)) * found.noise_scale
+    sigma = attached.sigma * found.noise_scale
     short: Jump | None = None
     tried = {False: 0, True: 0}  # of steps that last, and of short ones: many of these must not hide one that lasts
     while left.any():
@@ -95,6 +94,9 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
         side = found.is_used[first:] if at_end else found.is_used[:first]
         if tried[is_short] == _TRIED or (is_short and (short is not None or float(side.mean()) < _SIDE_USED)):
             continue
+        step = _sharpest(seconds, attached, found, first, sigma)
+        if not step.is_seen:
+            continue
         tried[is_short] += 1
         after = np.arange(len(attached)) >= first
         try:
@@ -103,9 +105,6 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
             continue
         share = float(_steps(split.errors)[largest] / steps[largest])
         gated, before = (int(np.count_nonzero(~own.is_used)) for own in (split, found))
-        # Fixes that state more than most do, as receivers do that lose theirs for a while, are judged by that.
-        stated = max(float(np.median(side)) if len(side) else 0.0 for side in _beside(attached.sigma, seconds, first))
-        step = _sharpest(seconds, attached, found, first, max(sigma, found.noise_scale * stated))
         freed = before - gated
         is_explained = freed >= 0 if share < _GONE else share < _LESS and freed >= _WINDOW and gated < _FEWER * before
         # A burst at the step hides what another datum leaves of it.
@@ -117,8 +116,7 @@ def jump_of(attached: AttachedFixes, found: Fit, refit: Callable[[NDArray[np.boo
         # Fixes on both sides were gated against a map between the two: a burst gives none of the others back, and chance a
         # few.
         gives_back = freed >= _WINDOW and gated <= _HALF * before and bend > OFF_SIGMAS
-        is_seen = max(step.gain, step.burst_gain, step.beside) >= _SEEN
-        if is_seen and (gives_back or (not step.is_burst and (is_explained or is_left or is_sure))):
+        if gives_back or (not step.is_burst and (is_explained or is_left or is_sure)):
             # Of the map that lies bent between both the errors step by less: it goes along.
             told = step.alone
             if is_explained or gives_back:
@@ -160,7 +158,7 @@ def _bend(found: Fit, split: Fit) -> float:
     )
 
 
-def _sharpest(seconds: Floats, attached: AttachedFixes, found: Fit, at: int, sigma: float) -> Step:
+def _sharpest(seconds: Floats, attached: AttachedFixes, found: Fit, at: int, sigma: Floats) -> Step:
     """The step at a fix or one beside it: means of a few fixes do not tell which.
 
     Bursts of multipath elsewhere, which the map does not rest on, say nothing of it, and a large one would be half of the step.
@@ -176,11 +174,11 @@ def _sharpest(seconds: Floats, attached: AttachedFixes, found: Fit, at: int, sig
 
 
 def _largest(
-    seconds: Floats, attached: AttachedFixes, errors: Floats, kept: NDArray[np.bool_], inside: range, sigma: float
+    seconds: Floats, attached: AttachedFixes, errors: Floats, kept: NDArray[np.bool_], inside: range, sigma: Floats
 ) -> Step:
     row, t, e = np.cumsum(kept) - 1, seconds[kept], errors[kept, :2]
-    walked = attached.walked[kept]
-    found = (step_at(t, e, int(row[k]), sigma, walked) for k in inside if row[k] > 0)
+    stated, walked = sigma[kept], attached.walked[kept]
+    found = (step_at(t, e, int(row[k]), stated, walked) for k in inside if row[k] > 0)
     return max(found, key=lambda step: step.gain)
 
 

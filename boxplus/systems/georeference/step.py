@@ -3,10 +3,15 @@
 Half a minute on either side the errors on the ground are a level, a slope (the map bends slowly) and noise: white, such as stays
 for τ, and what the odometry drifts at random, of variance w since the first of these fixes, with the covariance
 
-    K = σ_w² I + σ_s² exp(−|t − t'| / τ) + min(w, w').
+    K = diag σ_w² + min(σ_i² … σ_j²) exp(−|t_i − t_j| / τ) + min(w_i, w_j).
 
 As few fixes count beside those near to them in time, the map does not bend after every one: without the last, fixes known to
 centimetres step wherever the odometry drifts by more than that.
+
+Two fixes share what the best of them and of all between them states. A receiver that loses its fixed solution states half a metre
+in place of centimetres, and stays off by that for as long: all of these fixes are one measurement, and where they begin and end a
+step is held against what they state. What is off before and after them is known to centimetres all the same, and a second such
+stretch is off by something else. White noise is that of the successive fixes that state as much.
 
 Generalised least squares says by how much a step there lowers the cost, and by how much a burst does, of any duration, that
 begins or ends there. Either explains what the other does in part: of a datum that jumps, a burst explains little more than the
@@ -21,7 +26,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 
 Floats = NDArray[np.float64]
@@ -31,6 +36,8 @@ _LONGEST = 25.0  # s, from the first to the last fix of a burst: of a longer one
 _SHORTEST = 1.0  # s
 _DISTINCT = 1e-3  # of a column, what the first burst has to leave of it
 _STAYS = 30.0  # s, of the noise that stays
+_PAIRS = 5  # of fixes in a row: fewer do not tell their noise, which may be all that they state
+_SEEN = 12.0  # by which a step or burst lowers the cost at least: less is made by noise and by what the odometry drifts
 _LEAST = 20.0  # by which a step lowers the cost where there is one; two numbers, looked for all over a recording
 _SURE = 40.0  # where nothing else has to be asked: RTK that jumps by 0.35 m comes to 38 to 86, by 0.5 m to 70 to 165
 _BURST = 1.3  # times as much by a burst: then it is one
@@ -53,6 +60,11 @@ class Step:
     other: float
     metres: float
     metres_beside: float
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether there is more than noise, be it a step or a burst."""
+        return max(self.gain, self.burst_gain, self.beside) >= _SEEN
 
     @property
     def is_burst(self) -> bool:
@@ -84,12 +96,12 @@ class Step:
         return self.gain >= _SURE and self.burst_gain <= self.gain
 
 
-def step_at(seconds: Floats, errors: Floats, at: int, sigma: float, walked: Floats | None = None) -> Step:
+def step_at(seconds: Floats, errors: Floats, at: int, sigma: ArrayLike, walked: Floats | None = None) -> Step:
     """The step between fix `at` and the one before it; none where it lies in a gap of a minute.
 
     Args:
         seconds: (N,) of the fixes. errors: (N, 2) on the ground [m].
-        sigma: standard deviation of a fix that is believed [m], all of which may stay.
+        sigma: (N,) standard deviation that each of them is believed to have [m], or the same of all; all of it may stay.
         walked: (N,) variance that the odometry gained by drifting at random, from anywhere on [m²]; none if left out.
     """
     middle = 0.5 * (seconds[at - 1] + seconds[at])
@@ -97,8 +109,10 @@ def step_at(seconds: Floats, errors: Floats, at: int, sigma: float, walked: Floa
     t, e = seconds[near] - middle, errors[near]
     if not (t < 0.0).any() or not (t > 0.0).any():  # a gap in which nothing shows whether it lasts
         return Step(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    white = 1.4826 * float(np.median(np.abs(np.diff(errors, axis=0)))) / math.sqrt(2.0)
-    K = sigma**2 * np.exp(-np.abs(t[:, None] - t) / _STAYS) + max(white, 1e-3 * sigma) ** 2 * np.eye(len(t))
+    sigmas = np.broadcast_to(np.asarray(sigma, dtype=np.float64), seconds.shape)
+    stated = sigmas[near]
+    K = _shared(stated) * np.exp(-np.abs(t[:, None] - t) / _STAYS)
+    K += np.diag(np.maximum(_white(errors, sigmas, stated), 1e-3 * stated) ** 2)
     if walked is not None:
         w = np.maximum.accumulate(walked[near] - walked[near[0]])
         K += np.minimum(w[:, None], w)
@@ -123,6 +137,28 @@ def step_at(seconds: Floats, errors: Floats, at: int, sigma: float, walked: Floa
         return step
     whitened = solve_triangular(L, (t[:, None] >= t[1:]).astype(np.float64), lower=True)
     return replace(step, other=_best_of_all(t[1:], _without(Q, whitened), burst, left))
+
+
+def _shared(sigma: Floats) -> Floats:
+    """(n, n) variance that each two of successive fixes may share [m²]: the least that any from the one to the other states."""
+    least = np.minimum.accumulate(np.where(np.tri(len(sigma), k=-1), np.inf, sigma**2), axis=1)
+    return np.minimum(least, least.T)
+
+
+def _white(errors: Floats, sigma: Floats, stated: Floats) -> Floats:
+    """(n,) standard deviations [m] of what does not stay, of fixes that state so much: from how others that do differ in a row.
+
+    Args:
+        errors: (N, 2) of all fixes, sigma: (N,) what they state. stated: (n,).
+    """
+    level, wanted = (np.round(2.0 * np.log2(own)) for own in (sigma, stated))  # in steps of √2
+    least, most = np.minimum(level[1:], level[:-1]), np.maximum(level[1:], level[:-1])
+    differences, white = np.abs(np.diff(errors, axis=0)), stated.copy()
+    for own in np.unique(wanted):
+        alike = (least >= own - 1.0) & (most <= own + 1.0)
+        if np.count_nonzero(alike) >= _PAIRS:
+            white[wanted == own] = 1.4826 * float(np.median(differences[alike])) / math.sqrt(2.0)
+    return white
 
 
 def _best_of_all(edges: Floats, steps: Floats, burst: Floats, left: Floats) -> float:

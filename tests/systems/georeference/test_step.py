@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from boxplus.systems.georeference.step import step_at
+from boxplus.systems.georeference.step import _shared, step_at
 
 SECONDS = np.arange(100.0)
 
@@ -107,3 +107,39 @@ def test_in_a_gap_of_a_minute_there_is_no_step() -> None:
     seconds = np.concatenate([np.arange(0.0, 150.0, 10.0), np.arange(230.0, 400.0, 10.0)])
     step = step_at(seconds, np.outer(seconds > 200.0, [5.0, 0.0]), 15, 0.02)
     assert step.gain == 0.0 and not step.is_told and not step.is_sure
+
+
+def lost(begin: float, end: float, stated: float, off: float, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Errors (100, 2) of RTK and what it states (100,) [m], which loses its fixed solution from second to second."""
+    inside = (begin <= SECONDS) & (end > SECONDS)
+    white = np.where(inside, 0.1 * stated, 0.01)[:, None] * np.random.default_rng(seed).standard_normal((100, 2))
+    return white + off * np.outer(inside, [0.6, -0.8]), np.where(inside, stated, 0.02)
+
+
+@pytest.mark.parametrize("end", [45.0, 55.0, 90.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_stretch_of_fixes_counts_as_one_that_is_as_far_off_as_they_state(seed: int, end: float) -> None:
+    """Each of them counted for itself, so that sound RTK was said to jump where it lost its fixed solution, and said so."""
+    errors, sigma = lost(35.0, end, 0.4, 0.6, seed)
+    for at in (35, int(end)):
+        assert not step_at(SECONDS, errors, at, sigma).is_seen
+        assert step_at(SECONDS, errors, at, 0.02).is_seen  # of fixes that state centimetres it is a jump, or a burst
+    far, _ = lost(35.0, end, 0.4, 4.0, seed)
+    assert step_at(SECONDS, far, 35, sigma).is_seen  # ten times what they state is more than they say
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_jump_between_fixes_of_centimetres_shows_through_others(seed: int) -> None:
+    """Beside a stretch that states half a metre, and with its begin within one."""
+    jump = 0.4 * np.outer(SECONDS >= 50.0, [0.8, 0.6])
+    beside, sigma = lost(58.0, 70.0, 0.5, 0.5, seed)
+    assert step_at(SECONDS, beside + jump, 50, sigma).is_sure
+    within, sigma = lost(47.0, 54.0, 0.5, 0.5, seed)
+    assert step_at(SECONDS, within + jump, 54, sigma).is_told
+
+
+def test_what_fixes_share_is_the_least_from_one_to_the_other() -> None:
+    sigma = np.random.default_rng(3).choice([0.02, 0.3, 0.5], 30)
+    expected = [[(sigma[min(i, j) : max(i, j) + 1] ** 2).min() for j in range(30)] for i in range(30)]
+    np.testing.assert_array_equal(_shared(sigma), expected)
+    assert np.linalg.eigvalsh(_shared(sigma))[0] > -1e-12
