@@ -38,7 +38,8 @@ _DISTINCT = 1e-3  # of a column, what the first burst has to leave of it
 _STAYS = 30.0  # s, of the noise that stays
 _PAIRS = 5  # of fixes in a row: fewer do not tell their noise, which may be all that they state
 _SEEN = 12.0  # by which a step or burst lowers the cost at least: less is made by noise and by what the odometry drifts
-_LEAST = 20.0  # by which a step lowers the cost where there is one; two numbers, looked for all over a recording
+_BLOCK = 5.0  # s
+LEAST = 20.0  # by which a step lowers the cost where there is one; two numbers, looked for all over a recording
 _SURE = 40.0  # where nothing else has to be asked: RTK that jumps by 0.35 m comes to 38 to 86, by 0.5 m to 70 to 165
 _BURST = 1.3  # times as much by a burst: then it is one
 
@@ -74,7 +75,7 @@ class Step:
     @property
     def is_beside(self) -> bool:
         """Whether it is there beside a burst, which explains most of it."""
-        return self._comes_and_goes and self.beside >= _LEAST and self.other <= _BURST * self.beside
+        return self._comes_and_goes and self.beside >= LEAST and self.other <= _BURST * self.beside
 
     @property
     def _comes_and_goes(self) -> bool:
@@ -88,7 +89,7 @@ class Step:
     @property
     def is_told(self) -> bool:
         """Whether noise makes no such step, nor a burst."""
-        return self.gain >= _LEAST and not self.is_burst
+        return self.gain >= LEAST and not self.is_burst
 
     @property
     def is_sure(self) -> bool:
@@ -109,21 +110,13 @@ def step_at(seconds: Floats, errors: Floats, at: int, sigma: ArrayLike, walked: 
     t, e = seconds[near] - middle, errors[near]
     if not (t < 0.0).any() or not (t > 0.0).any():  # a gap in which nothing shows whether it lasts
         return Step(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    sigmas = np.broadcast_to(np.asarray(sigma, dtype=np.float64), seconds.shape)
-    stated = sigmas[near]
-    K = _shared(stated) * np.exp(-np.abs(t[:, None] - t) / _STAYS)
-    K += np.diag(np.maximum(_white(errors, sigmas, stated), 1e-3 * stated) ** 2)
-    if walked is not None:
-        w = np.maximum.accumulate(walked[near] - walked[near[0]])
-        K += np.minimum(w[:, None], w)
-    L = np.linalg.cholesky(K)
+    L = _root(t, errors, np.broadcast_to(np.asarray(sigma, dtype=np.float64), seconds.shape), walked, near)
 
     after, before = t[t > 0.0], t[t < 0.0]
     ends = after[1:][(after[1:] > _SHORTEST) & (after[:-1] - after[0] <= _LONGEST)]
     begins = before[(before < -_SHORTEST) & (before[-1] - before <= _LONGEST)]
     shapes = [t > 0.0, *((t > 0.0) & (t < end) for end in ends), *((t < 0.0) & (t >= begin) for begin in begins)]
-    base = solve_triangular(L, np.column_stack([np.ones(len(t)), t]), lower=True)
-    Q = np.linalg.qr(base)[0]
+    Q = _base(L, t)
     r, columns = (_without(Q, solve_triangular(L, own, lower=True)) for own in (e, np.column_stack(shapes).astype(np.float64)))
     gain, metres = _explained(columns, r)
     if len(gain) == 1:
@@ -137,6 +130,46 @@ def step_at(seconds: Floats, errors: Floats, at: int, sigma: ArrayLike, walked: 
         return step
     whitened = solve_triangular(L, (t[:, None] >= t[1:]).astype(np.float64), lower=True)
     return replace(step, other=_best_of_all(t[1:], _without(Q, whitened), burst, left))
+
+
+def step_gains(seconds: Floats, errors: Floats, sigma: Floats, walked: Floats) -> Floats:
+    """(N,) by how much a step between each fix and the one before it lowers the cost; 0 of the first, and in a gap of a minute.
+
+    Those of five seconds are asked of what lies about their middle.
+
+    Args:
+        As `step_at`.
+    """
+    gains, block = np.zeros(len(seconds)), np.floor((seconds - seconds[0]) / _BLOCK)
+    for one in np.unique(block[1:]):
+        at = 1 + np.flatnonzero(block[1:] == one)
+        middle = 0.5 * (seconds[at[0] - 1] + seconds[at[-1]])
+        near = np.flatnonzero(np.abs(seconds - middle) <= _REACH)
+        at = at[(at > near[0]) & (at <= near[-1])] if len(near) else at[:0]
+        if not len(at):
+            continue
+        t = seconds[near] - middle
+        L = _root(t, errors, sigma, walked, near)
+        Q = _base(L, t)
+        r, columns = (_without(Q, solve_triangular(L, own, lower=True)) for own in (errors[near], 1.0 * (near[:, None] >= at)))
+        gains[at] = _explained(columns, r)[0]
+    return gains
+
+
+def _root(t: Floats, errors: Floats, sigma: Floats, walked: Floats | None, near: NDArray[np.intp]) -> Floats:
+    """(n, n) lower root of K at times t (n,), of fixes `near` (n,) of all (N,)."""
+    stated = sigma[near]
+    K = _shared(stated) * np.exp(-np.abs(t[:, None] - t) / _STAYS)
+    K += np.diag(np.maximum(_white(errors, sigma, stated), 1e-3 * stated) ** 2)
+    if walked is not None:
+        w = np.maximum.accumulate(walked[near] - walked[near[0]])
+        K += np.minimum(w[:, None], w)
+    return np.asarray(np.linalg.cholesky(K))
+
+
+def _base(L: Floats, t: Floats) -> Floats:
+    """(n, 2) orthonormal columns that a level and a slope span."""
+    return np.asarray(np.linalg.qr(solve_triangular(L, np.column_stack([np.ones(len(t)), t]), lower=True))[0])
 
 
 def _shared(sigma: Floats) -> Floats:

@@ -57,3 +57,10 @@ def test_stretches_that_are_not_fixed_hide_no_jump() -> None:
     said, silent = laid(given, jumped), laid(given, sound)
     assert said.contradiction is not None and "fixes jump by 0." in said.contradiction
     assert silent.fit is not None and not jumps(silent)
+
+
+def test_a_jump_that_the_map_bends_along_with_is_told() -> None:
+    """No means of five fixes stepped, as the odometry may drift by as much: off by four standard deviations without a word."""
+    given = drive(LAPS, 12)
+    result = laid(given, given.fixes(RTK.model_copy(update={"jump": (0.28, 0.21, 0.0)}), 12))
+    assert result.contradiction is not None and "fixes jump by 0." in result.contradiction

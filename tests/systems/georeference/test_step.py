@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from boxplus.systems.georeference.step import _shared, step_at
+from boxplus.systems.georeference.step import _shared, step_at, step_gains
 
 SECONDS = np.arange(100.0)
 
@@ -143,3 +143,14 @@ def test_what_fixes_share_is_the_least_from_one_to_the_other() -> None:
     expected = [[(sigma[min(i, j) : max(i, j) + 1] ** 2).min() for j in range(30)] for i in range(30)]
     np.testing.assert_array_equal(_shared(sigma), expected)
     assert np.linalg.eigvalsh(_shared(sigma))[0] > -1e-12
+
+
+def test_every_fix_is_asked_for_a_step_as_one_alone_is() -> None:
+    """About the middle of five seconds, in a recording with a gap of two minutes, in which there is none."""
+    seconds = np.concatenate([SECONDS, SECONDS + 220.0])
+    random, sigma, walked = np.random.default_rng(4), np.full(200, 0.02), np.cumsum(np.full(200, 0.03**2))
+    errors = 0.02 * random.standard_normal((200, 2)) + 0.3 * np.outer(seconds >= 47.0, [0.6, 0.8])
+    gains = step_gains(seconds, errors, sigma, walked)
+    assert gains.shape == (200,) and gains[0] == 0.0 and gains[100] == 0.0 and int(np.argmax(gains)) == 47
+    for at in (47, 52, 147):
+        assert gains[at] == pytest.approx(step_at(seconds, errors, at, sigma, walked).gain, rel=0.1, abs=0.5)
