@@ -158,8 +158,9 @@ def _compare(
         found = _compared(surer, imu, T_guess, T_declared)
     # Undistorted at constant rates, a fast turn bends the path by as much as a wrong scale.
     slope = 1.0 if found.translation is None else found.translation.slope
+    bent = slope > 0.0 and abs(slope - 1.0) > _SLOPE_DOUBTFUL
     steady = found.rotation
-    if (refine or (slope > 0.0 and _off(slope)) or _turns_off(steady)) and steady is not None and steady.explained > _EXPLAINED:
+    if (refine or bent or _turns_off(steady)) and steady is not None and steady.explained > _EXPLAINED:
         shift_ns = round(steady.offset_s * 1e9) if steady.offset_std_s < _OFFSET_KNOWN_S else 0
         corrected = GyroAttitude(imu.time_ns, (imu.gyro - steady.bias) / unit_of(steady.scale))
         refined = lidar_path(
@@ -253,7 +254,7 @@ def _widened(covariance: NDArray[np.float64], row: int, std: float) -> NDArray[n
 def _doubtful(found: Agreement, T_declared: NDArray[np.float64] | None) -> bool:
     """Whether a comparison says that something is wrong: if not with the sensors, then with the path."""
     rotation, translation = found.rotation, found.translation
-    if translation is not None and translation.explained > _HALF_EXPLAINED and _off(translation.slope):
+    if translation is not None and translation.explained > _HALF_EXPLAINED and _lengths_off(translation):
         return True
     if rotation is None:
         return False
@@ -271,8 +272,9 @@ def _turns_off(rotation: RotationFit | None) -> bool:
     return abs(rotation.scale / unit_of(rotation.scale) - 1.0) > max(_TURNS_DOUBTFUL, 3.0 * rotation.scale_std)
 
 
-def _off(slope: float) -> bool:
-    return abs(slope - 1.0) > _SLOPE_DOUBTFUL
+def _lengths_off(translation: TranslationFit) -> bool:
+    """Whether lengths seem to be wrong, by more than they are known to."""
+    return abs(translation.slope - 1.0) > max(_SLOPE_DOUBTFUL, translation.slope_std)
 
 
 def _power(imu: ImuSamples) -> float:
