@@ -79,7 +79,8 @@ class LidarInertialOdometry(Snapshots):
         self.start: Start | None = None
         self.start_problem: str | None = None  # why there was none sooner
         self._sequencer = Sequencer()
-        self._search, self._time_ns = StartSearch(self.config), 0  # and the instant of the state
+        self._search = StartSearch(self.config)
+        self._time_ns = 0  # of the state
         self._voxel_filter = VoxelFilter(self.config.scan_voxel, self.config.max_points)
         self._box, self._excitation = SlidingBox(self.config.box_side, self.config.detection_range), RotationExcitation()
         self._standstill: Standstill | None = None
@@ -137,7 +138,7 @@ class LidarInertialOdometry(Snapshots):
     def flush(self) -> list[Estimate]:
         """No more data will come: process what still waits for IMU samples."""
         estimates = self._advance(self._sequencer.frames(flush=True))
-        if self.start is None and self._search.frames:
+        while self.start is None and self._search.frames:  # once more, where a gap follows the start
             estimates += self._try_start()
             if self.start is None:
                 self._search.give_up()

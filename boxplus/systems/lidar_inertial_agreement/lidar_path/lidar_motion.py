@@ -41,6 +41,11 @@ class GrowingPath:
         """Scans that could not be registered so far."""
         return self._tracks[0].failed
 
+    @property
+    def is_torn(self) -> bool:
+        """Whether scans do not lie upon the ones before them: one could not be registered, or came long after the last."""
+        return self._tracks[0].is_torn
+
     def path(self) -> LidarPath:
         """Through all scans so far."""
         return self._tracks[0].path()

@@ -92,14 +92,14 @@ def _path_at(
 ) -> LidarPath | None:
     """The path through the same scans that begins with another velocity (3,), where it fits about as well and stays another.
 
-    It ends as soon as that is decided: what it costs only grows, and one that moves as the other does will not leave it any more.
+    It ends once that is decided: what it costs only grows, and one that moves as the other does is not expected to leave it.
     """
     growing = GrowingPath(config, guesses, undistort=True, velocity=velocity)
     most = _AS_WELL * float(path.cost.sum())
     for scan in scans:
         growing.add(scan)
         other = growing.path()
-        if growing.failed or float(other.cost.sum()) > most or _has_joined(other, path):
+        if growing.failed or float(other.cost.sum()) >= most or _has_joined(other, path):
             return None
     return other if len(other) == len(path) else None
 

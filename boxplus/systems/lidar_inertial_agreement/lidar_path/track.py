@@ -77,6 +77,11 @@ class Track:
         return self._failed
 
     @property
+    def is_torn(self) -> bool:
+        """Whether it has begun anew."""
+        return self._segment > 0
+
+    @property
     def length(self) -> int:
         """Poses since the track began, or began anew."""
         return sum(pose.segment == self._segment for pose in self._poses)

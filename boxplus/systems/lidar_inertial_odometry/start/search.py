@@ -8,7 +8,7 @@ from boxplus.systems.lidar_inertial_odometry.start.grown_paths import GrownPaths
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start
 from boxplus.systems.lidar_inertial_odometry.start.unstarted import UnstartedScans
 
-_MOST_SCANS, _FEWER = 40, 30  # that wait, and that stay where they are more
+_MOST_SCANS, _FEWER = 40, 30  # with so many, a refusal leaves no more than that
 _NEW = 0.3  # share of them that is new in every try
 
 
@@ -54,18 +54,23 @@ class StartSearch:
     def give_up(self) -> None:
         """No more scans will come: what the sensors contradict is added to the problem."""
         self._forget(len(self.frames))
+        self._next_try = 0
         self.problem = self._unstarted.named(self.problem)
 
     def _outlived(self) -> int:
-        """How many of the oldest scans make room, so that a start that takes long stays cheap: up to where a path goes on."""
-        begun = [k for k, frame in enumerate(self.frames) if self._grown.unbroken_from(frame.scan)]
-        if begun and len(self.frames) < _MOST_SCANS:  # a path that has lost hold will not find it again
-            return begun[0]
+        """How many of the oldest scans make room, so that a start that takes long stays cheap: up to where another path began."""
+        begun = [k for k, frame in enumerate(self.frames) if self._grown.is_whole_from(frame.scan)]
+        if begun and begun[0] > 0:  # the oldest path is torn, and stays so; the last that began has been gone on with just now
+            return begun[-1]
+        if len(self.frames) < _MOST_SCANS:
+            return 0
         fewest = len(self.frames) - _FEWER
-        return min((k for k in begun if k >= fewest), default=max(fewest, 0))
+        return min((k for k in begun if k >= fewest), default=fewest)
 
     def _forget(self, oldest: int) -> None:
         self.forgotten += self._unstarted.add(self.frames[:oldest])
         del self.frames[:oldest]
         if self.frames:
             self._grown.forget_before(self.frames[0].scan)
+        else:
+            self._grown = GrownPaths()

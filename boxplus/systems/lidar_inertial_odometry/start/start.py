@@ -111,12 +111,12 @@ def find_start(frames: Sequence[Frame], config: LioConfig, grown: GrownPaths | N
         return _start(seen, grown)
     except NotYet as reason:
         refusal = str(reason)
-    newest = _newest(frames, config.start_duration, grown)
-    if newest:
+    newest = _newest(frames, config.start_duration)
+    if len(newest) < _MUCH_SHORTER * len(frames):
         try:
             return _start(Beginning(newest, config), grown)
         except NotYet as reason:
-            if not grown.unbroken_from(frames[0].scan):  # then that says nothing of the newest
+            if not grown.is_whole_from(frames[0].scan):  # then that says nothing of the newest
                 refusal = str(reason)
     return refusal
 
@@ -142,17 +142,11 @@ def _start(seen: Beginning, grown: GrownPaths) -> Start:
     return _moving_start(seen, path, grown, motion)
 
 
-def _newest(frames: Sequence[Frame], seconds: float, grown: GrownPaths) -> Sequence[Frame]:
-    """Much fewer than all of the frames, enough of them for a start; none where there are no fewer.
-
-    From where a path goes on; where none does, just enough of them.
-    """
+def _newest(frames: Sequence[Frame], seconds: float) -> Sequence[Frame]:
+    """The last frames, just enough of them for a start."""
     times = np.array([frame.scan.start_ns for frame in frames])
     enough = int(np.searchsorted(times, frames[-1].scan.end_ns - round(seconds * 1e9), side="right")) - 1
-    latest = min(enough, len(frames) - _MIN_MOVING_SCANS)
-    much_later = range(int((1.0 - _MUCH_SHORTER) * len(frames)) + 1, latest + 1)
-    begun = [k for k in much_later if grown.unbroken_from(frames[k].scan)]
-    return frames[begun[0] :] if begun else frames[latest:] if latest in much_later else []
+    return frames[max(min(enough, len(frames) - _MIN_MOVING_SCANS), 0) :]
 
 
 def _check_accelerometer(norm: float) -> None:

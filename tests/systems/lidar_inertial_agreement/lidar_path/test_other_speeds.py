@@ -34,7 +34,7 @@ def circle(world: World, height: float) -> tuple[Simulation, np.ndarray | None, 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_a_speed_over_open_ground_is_right_or_not_known_or_not_the_only_one(seed: int) -> None:
-    """From rest the fields 0 to 5 end at 2.4, 2.3, 7.7, 4.7, 2.3 and 0.1 m/s; 2 and 3 have another speed, 5 knows nothing."""
+    """Field 2 fits at 3.2 m/s about as well as at 2.4 m/s."""
     simulation, other, found, sigma = circle(sites.open_field(3, seed), 1.5)
     if other is None and sigma < 1.0:
         truth = simulation.ground_truth(np.array([simulation.start_ns, simulation.end_ns]))
@@ -42,6 +42,7 @@ def test_a_speed_over_open_ground_is_right_or_not_known_or_not_the_only_one(seed
         assert abs(np.linalg.norm(found) - mean) < 0.3
     elif other is not None:
         assert np.linalg.norm(other - found) > 0.3
+    assert other is not None or seed != 2
 
 
 @pytest.mark.slow
