@@ -27,15 +27,15 @@ from boxplus.sensors.inertial.imu_values import beyond, empty, finite, glitches
 from boxplus.sensors.lidar.scan import Scan, in_order
 from boxplus.systems.lidar_inertial_agreement.corrected_points import CorrectedPoints, corrected_points
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
-from boxplus.systems.lidar_inertial_agreement.ground_lean import GroundLean, drives, ground_lean
 from boxplus.systems.lidar_inertial_agreement.lidar_path.backwards import surer_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import expected_path, explained_scans
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, with_cells_for_all
-from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
+from boxplus.systems.lidar_inertial_agreement.planes.ground_lean import GroundLean, drives, ground_lean
+from boxplus.systems.lidar_inertial_agreement.planes.plane_tilt import PlaneTilt, plane_tilt
+from boxplus.systems.lidar_inertial_agreement.planes.surroundings import surroundings_of
 from boxplus.systems.lidar_inertial_agreement.rotation import SCALE, RotationFit, compare_rotations
-from boxplus.systems.lidar_inertial_agreement.surroundings import surroundings_of
 from boxplus.systems.lidar_inertial_agreement.translation import SLOPE, TranslationFit, compare_accelerations, wide_prior
 
 _EXPLAINED = 0.8  # of the LiDAR's rotation, before the gyroscope may help to undistort

@@ -20,7 +20,6 @@ from boxplus.systems.lidar_inertial_agreement.agreement import (
     unit_of,
 )
 from boxplus.systems.lidar_inertial_agreement.finding import Cause, Finding
-from boxplus.systems.lidar_inertial_agreement.leaning import leaning
 from boxplus.systems.lidar_inertial_agreement.lengths import (
     MISFIT_M,
     SLOPE_FLOOR,
@@ -28,6 +27,7 @@ from boxplus.systems.lidar_inertial_agreement.lengths import (
     feet_finding,
     slope_finding,
 )
+from boxplus.systems.lidar_inertial_agreement.planes.leaning import leaning
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit
 from boxplus.systems.lidar_inertial_agreement.translation import TURN, TranslationFit
 

@@ -21,7 +21,7 @@ from boxplus.manifolds import so3
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.local_maps.vertical import find_vertical
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import CommonMotion, common_motion
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.common_motion import CommonMotion, common_motion
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import turning_through
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import Poses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of

@@ -21,7 +21,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
-from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import explains_changes
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.common_motion import explains_changes
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Poses, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
 from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surface_distances

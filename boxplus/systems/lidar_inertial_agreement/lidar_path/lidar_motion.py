@@ -17,7 +17,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
-from boxplus.systems.lidar_inertial_agreement.lidar_path.track import Track
+from boxplus.systems.lidar_inertial_agreement.lidar_path.tracks.track import Track
 
 _FOLLOWED = 5  # poses of a track, the first two included, after which the others that began with it are given up
 

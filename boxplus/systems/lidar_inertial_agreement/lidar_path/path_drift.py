@@ -18,7 +18,7 @@ from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.older_scans import deviations_of, map_of, register_to
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, nodes_within, thinned, undistorted
-from boxplus.systems.lidar_inertial_agreement.lidar_path.scan_fit import MOST_MAP_POINTS, MOST_POINTS, MOST_RAW
+from boxplus.systems.lidar_inertial_agreement.lidar_path.tracks.scan_fit import MOST_MAP_POINTS, MOST_POINTS, MOST_RAW
 
 _MAP_SCANS = 5
 _TRIED = 4  # of the last scans: not every one shows enough of the same place

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._words import signed
-from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import changed_share
-from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import common_motion
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.changed_points import changed_share
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.common_motion import common_motion
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.standing import shows_rest
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
     least_known_axis,
@@ -25,7 +26,6 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
 )
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
-from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
 from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING, Beginning, NotYet, broken
 

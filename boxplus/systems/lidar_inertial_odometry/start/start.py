@@ -15,7 +15,7 @@ from boxplus.filtering.nav_state import T_V, NavState
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
-from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import speaks_against
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.common_motion import speaks_against
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import (
     least_known_axis,
     mean_velocity,

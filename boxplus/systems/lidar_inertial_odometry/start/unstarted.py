@@ -10,7 +10,7 @@ from boxplus.sensors.sequencer import Frame, joined_imu
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import thinned, with_cells_for_all
-from boxplus.systems.lidar_inertial_agreement.plane_of_scans import tilted_plane, untilted_plane
+from boxplus.systems.lidar_inertial_agreement.planes.plane_of_scans import tilted_plane, untilted_plane
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem_of
 

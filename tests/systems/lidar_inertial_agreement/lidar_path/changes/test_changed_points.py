@@ -9,7 +9,7 @@ from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation, SpinningLidar
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import sites
-from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import ChangedPoints, changed_share
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.changed_points import ChangedPoints, changed_share
 
 
 def street(lidar: SpinningLidar | RosetteLidar, speed: float) -> tuple[Scan, Scan]:

@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.systems.lidar_inertial_agreement.surroundings import Surroundings
+from boxplus.systems.lidar_inertial_agreement.planes.surroundings import Surroundings
 
 _LEAST_OF_TWO = 0.1  # of the planar points, where there is no third direction
 _ORTHOGONAL_RAD = np.deg2rad(1.5)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import (
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.changed_points import (
     FAR_M,
     MOST_COMPARED,
     NEAR_M,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus.systems.lidar_inertial_agreement.ground_lean import GroundLean
-from boxplus.systems.lidar_inertial_agreement.leaning import leaning
-from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt
+from boxplus.systems.lidar_inertial_agreement.planes.ground_lean import GroundLean
+from boxplus.systems.lidar_inertial_agreement.planes.leaning import leaning
+from boxplus.systems.lidar_inertial_agreement.planes.plane_tilt import PlaneTilt
 
 
 @pytest.mark.parametrize(

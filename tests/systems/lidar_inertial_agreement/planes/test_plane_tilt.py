@@ -18,8 +18,8 @@ from boxplus.simulation.worlds.world import World
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
-from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt, plane_tilt
-from boxplus.systems.lidar_inertial_agreement.surroundings import surroundings_of
+from boxplus.systems.lidar_inertial_agreement.planes.plane_tilt import PlaneTilt, plane_tilt
+from boxplus.systems.lidar_inertial_agreement.planes.surroundings import surroundings_of
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from boxplus.systems.lidar_inertial_agreement.finding import Finding
-from boxplus.systems.lidar_inertial_agreement.ground_lean import GroundLean
-from boxplus.systems.lidar_inertial_agreement.plane_tilt import PlaneTilt
+from boxplus.systems.lidar_inertial_agreement.planes.ground_lean import GroundLean
+from boxplus.systems.lidar_inertial_agreement.planes.plane_tilt import PlaneTilt
 
 _UPRIGHT_RAD = np.deg2rad(4.0)  # what an accelerometer's bias of 0.7 m/s² tilts
 _MIRRORS_RAD, _MIRRORS_SHARE = np.deg2rad(1.5), 0.2  # the tilt that a mirrored axis leaves, and its share of the tilt without

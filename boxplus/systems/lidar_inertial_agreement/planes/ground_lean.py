@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
-from boxplus.systems.lidar_inertial_agreement.surroundings import TIGHT_RAD, Surroundings
+from boxplus.systems.lidar_inertial_agreement.planes.surroundings import TIGHT_RAD, Surroundings
 
 _LEAST_SHARE = 0.1  # of the planar points
 _SLOWEST_M_S, _SHORTEST_M = 3.0, 10.0

@@ -13,7 +13,7 @@ from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.motions.spline import Trajectory
 from boxplus.simulation.worlds import sites, worlds
 from boxplus.simulation.worlds.world import World
-from boxplus.systems.lidar_inertial_agreement.plane_of_scans import tilted_plane, untilted_plane
+from boxplus.systems.lidar_inertial_agreement.planes.plane_of_scans import tilted_plane, untilted_plane
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data
 
 LIDAR = SpinningLidar(channels=24, azimuth_steps=120, rate_hz=5.0)

@@ -15,7 +15,7 @@ from boxplus.maps.ikd_tree import IkdTree
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import GOOD_MISFIT_M
-from boxplus.systems.lidar_inertial_agreement.lidar_path.scan_fit import ScanFit, ScanFitter, Standing
+from boxplus.systems.lidar_inertial_agreement.lidar_path.tracks.scan_fit import ScanFit, ScanFitter, Standing
 
 _FIRST_SPEEDS = 5.0, 10.0  # m/s, both ways along every axis
 _SETTLES, _SETTLED_M_S, _SAME_RATE = 4, 0.3, 0.05  # rounds; m/s and rad/s between two motions that are one

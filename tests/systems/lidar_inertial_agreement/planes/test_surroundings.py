@@ -7,7 +7,7 @@ import numpy as np
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, mounting
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import worlds
-from boxplus.systems.lidar_inertial_agreement.surroundings import surroundings_of
+from boxplus.systems.lidar_inertial_agreement.planes.surroundings import surroundings_of
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, true_path
 
 EXACT = ImuModel(accel_bias=(0.0, 0.0, 0.0), gyro_bias=(0.0, 0.0, 0.0))

@@ -16,17 +16,17 @@ from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import sites
 from boxplus.simulation.worlds.world import World, box
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
-from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import changed_share
-from boxplus.systems.lidar_inertial_agreement.lidar_path.common_motion import (
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.changed_points import changed_share
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.common_motion import (
     CommonMotion,
     common_motion,
     explains_changes,
     speaks_against,
 )
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.standing import shows_rest
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import explained_scans
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
-from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, true_poses, true_twists
 
 LIDAR = SpinningLidar(channels=32, azimuth_steps=512, vertical_fov_deg=(-25.0, 15.0))

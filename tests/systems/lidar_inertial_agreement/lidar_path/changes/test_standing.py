@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import shows_rest, stay_and_go
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.standing import shows_rest, stay_and_go
 
 AHEAD, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 

@@ -14,9 +14,9 @@ from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import sites
 from boxplus.simulation.worlds.world import World, box, rectangle
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors
-from boxplus.systems.lidar_inertial_agreement.ground_lean import GroundLean, drives, ground_lean
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
-from boxplus.systems.lidar_inertial_agreement.surroundings import Surroundings, surroundings_of
+from boxplus.systems.lidar_inertial_agreement.planes.ground_lean import GroundLean, drives, ground_lean
+from boxplus.systems.lidar_inertial_agreement.planes.surroundings import Surroundings, surroundings_of
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, true_path, true_twists
 
 LIDAR = SpinningLidar(channels=24, azimuth_steps=180, vertical_fov_deg=(-30.0, 10.0))

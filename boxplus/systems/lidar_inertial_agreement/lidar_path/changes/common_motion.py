@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 from boxplus._words import signed
 from boxplus.manifolds import so3
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.changed_points import ChangedPoints, changed_points
-from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
-from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
-from boxplus.systems.lidar_inertial_agreement.lidar_path.standing import (
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.changed_points import ChangedPoints, changed_points
+from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.standing import (
     ASIDE_M,
     FASTEST_M_S,
     FEWEST_SCANS,
     shows_rest,
     stay_and_go,
 )
+from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
 
 _PAIRS = 0, 2, 4  # first scans of those that vote
 _MOST_VOTERS = 800

@@ -16,10 +16,10 @@ from boxplus.filtering.nav_state import NavState, P, R
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.systems.lidar_inertial_agreement.lidar_path.first_speeds import first_fits
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of, thinned
-from boxplus.systems.lidar_inertial_agreement.lidar_path.scan_fit import MOST_RAW, ScanFit, ScanFitter, Standing
+from boxplus.systems.lidar_inertial_agreement.lidar_path.tracks.first_speeds import first_fits
+from boxplus.systems.lidar_inertial_agreement.lidar_path.tracks.scan_fit import MOST_RAW, ScanFit, ScanFitter, Standing
 
 _MOST_SEARCHES = 3  # failures after which no speed is tried any more: it is not the speed
 _LONGEST_STEP_S = 1.0

@@ -20,7 +20,7 @@ from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import middle_of
-from boxplus.systems.lidar_inertial_agreement.surroundings import planar_points, plane_directions
+from boxplus.systems.lidar_inertial_agreement.planes.surroundings import planar_points, plane_directions
 
 _SCANS, _MOST_POINTS = 10, 5000
 _FEWEST_SCANS, _FEWEST_SAMPLES = 3, 10

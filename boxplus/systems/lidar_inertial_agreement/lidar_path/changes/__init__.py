@@ -1,0 +1,1 @@
+"""What changes from scan to scan, and the motion that explains it, or the rest."""
