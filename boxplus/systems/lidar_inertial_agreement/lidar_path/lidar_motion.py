@@ -23,18 +23,10 @@ _FOLLOWED = 5  # poses of a track, the first two included, after which the other
 
 
 class GrowingPath:
-    """The path of the LiDAR through scans as they come, in order of time; arguments as for `lidar_path`."""
+    """The path of the LiDAR through scans as they come, in order of time: of a track, and of those that it forks into."""
 
-    def __init__(
-        self,
-        config: RegistrationConfig,
-        guesses: Sequence[Turning] = (),
-        *,
-        undistort: bool = False,
-        velocity: NDArray[np.float64] | None = None,
-        held: bool = False,
-    ) -> None:
-        self._tracks = [Track(config, guesses, undistort=undistort, velocity=velocity, held=held)]
+    def __init__(self, track: Track) -> None:
+        self._tracks = [track]
 
     @property
     def failed(self) -> int:
@@ -83,7 +75,7 @@ def lidar_path(
         held: whether the LiDAR moves as far along its way as is expected, whatever the scan says of that (`common_motion`).
         unbroken: whether to stop at the first scan that cannot be registered: the most costly one, as all starts are tried.
     """
-    growing = GrowingPath(config, guesses, undistort=undistort, velocity=velocity, held=held)
+    growing = GrowingPath(Track(config, guesses, undistort=undistort, velocity=velocity, held=held))
     for number, scan in enumerate(scans):
         growing.add(scan, None if expected is None else expected[number])
         if unbroken and growing.failed:

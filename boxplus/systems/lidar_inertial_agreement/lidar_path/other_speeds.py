@@ -16,6 +16,7 @@ from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import GrowingPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning
+from boxplus.systems.lidar_inertial_agreement.lidar_path.tracks.track import Track
 
 _SURE_M = 0.006  # standard deviation of a pose, along all axes, below which no other minimum is looked for
 _APART_M_S = 1.0, 2.0  # both ways along the two axes that are known least
@@ -94,7 +95,7 @@ def _path_at(
 
     It ends once that is decided: what it costs only grows, and one that moves as the other does is not expected to leave it.
     """
-    growing = GrowingPath(config, guesses, undistort=True, velocity=velocity)
+    growing = GrowingPath(Track(config, guesses, undistort=True, velocity=velocity))
     most = _AS_WELL * float(path.cost.sum())
     for scan in scans:
         growing.add(scan)

@@ -11,6 +11,7 @@ from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import GrowingPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.tracks.track import Track
 from boxplus.systems.lidar_inertial_odometry.start.beginning import Beginning
 
 _SAME_BIAS, _SAME_SPEED = 0.01, 0.1  # rad/s, m/s: with others a path is another
@@ -35,7 +36,7 @@ class GrownPaths:
         """The path through all scans, as `lidar_path` has it; those of the try before may be less, from the same one on."""
         begin = self._begin(seen)
         self._as_seen = self._as_seen or {}
-        growing, taken = self._as_seen.get(begin) or (GrowingPath(seen.registration), 0)
+        growing, taken = self._as_seen.get(begin) or (GrowingPath(Track(seen.registration)), 0)
         growing.turn_by(seen.guesses)
         self._as_seen[begin] = _gone_on(growing, seen.scans, taken)
         self._whole[begin] = not growing.is_torn
@@ -54,7 +55,7 @@ class GrownPaths:
             self._steady.pop(begin, None)
         guesses = gyro_guesses(replace(seen.imu, gyro=seen.imu.gyro - known[0]), seen.extrinsic.R_imu_lidar)
         grown = self._steady.get(begin)
-        growing, taken = grown or (GrowingPath(seen.registration, guesses, undistort=True, velocity=known[1]), 0)
+        growing, taken = grown or (GrowingPath(Track(seen.registration, guesses, undistort=True, velocity=known[1])), 0)
         growing.turn_by(guesses)
         self._steady[begin] = _gone_on(growing, seen.scans, taken)
         return growing.path()

@@ -13,9 +13,9 @@ from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import sites, worlds
-from boxplus.systems.lidar_inertial_agreement.lidar_path import scan_fit
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.tracks import scan_fit
 from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, FINE, data, handheld, true_poses, true_twists
 
 
