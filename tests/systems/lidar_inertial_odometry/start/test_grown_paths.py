@@ -13,7 +13,7 @@ from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.simulation import Simulation, simulate
-from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import GrowingPath, lidar_path
+from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import middle_of
 from boxplus.systems.lidar_inertial_odometry.start.beginning import Beginning
@@ -33,20 +33,6 @@ def seen(drive: Simulation) -> list[Frame]:
 
 def _same(path: LidarPath, other: LidarPath) -> bool:
     return all(np.array_equal(getattr(path, name), getattr(other, name)) for name in LidarPath.__slots__)
-
-
-@pytest.fixture
-def registered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """When the scans began that have been registered."""
-    begins: list[int] = []
-    add = GrowingPath.add
-
-    def counted(self: GrowingPath, scan: Scan, expected: object = None) -> None:
-        begins.append(scan.start_ns)
-        add(self, scan)
-
-    monkeypatch.setattr(GrowingPath, "add", counted)
-    return begins
 
 
 def test_a_path_goes_on_as_if_all_scans_had_been_there_at_once(
@@ -81,7 +67,7 @@ def test_what_no_try_begins_with_any_more_is_forgotten(drive: Simulation, seen: 
         grown.through(Beginning(seen[begin:10], settings))
     grown.forget_before(seen[4].scan)
     assert not grown.is_whole_from(seen[0].scan) and grown.is_whole_from(seen[4].scan)
-    assert grown._as_seen is not None and list(grown._as_seen) == [seen[4].scan.end_ns]
+    assert list(grown._begun) == [seen[4].scan.end_ns]
     registered.clear()
     grown.through(Beginning(seen[4:11], settings))
     assert registered == [seen[10].scan.start_ns]
