@@ -328,7 +328,7 @@ def apart(
     """How far a mounting is from the found one [rad], about the axes known to three degrees, or `known_rad`; which, (3,)."""
     std, axes = fit.rotation_std
     seen = std < known_rad
-    angle = axes.T @ so3.log(fit.R_imu_lidar @ R_imu_lidar.T)
+    angle = axes.T @ so3.log(fit.closest_to(R_imu_lidar) @ R_imu_lidar.T)
     return float(np.linalg.norm(angle[seen])), seen
 
 

@@ -32,7 +32,7 @@ def turn_from(fit: RotationFit, R_imu_lidar: NDArray[np.float64]) -> Turn:
     """
     variance, axes = np.linalg.eigh(fit.covariance[:3, :3])
     known = np.where(variance < _KNOWN_RAD**2, 1.0 / variance, 0.0)
-    return so3.log(fit.R_imu_lidar @ R_imu_lidar.T), (axes * known) @ axes.T
+    return so3.log(fit.closest_to(R_imu_lidar) @ R_imu_lidar.T), (axes * known) @ axes.T
 
 
 def combined(turns: Sequence[Turn]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

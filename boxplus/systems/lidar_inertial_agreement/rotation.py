@@ -9,7 +9,7 @@ does not show is not claimed.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from boxplus.manifolds import so3
 from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
+from boxplus.systems.lidar_inertial_agreement.scan_pairs import scan_pairs
 
 _LARGEST_OFFSET_S = 0.6
 _OFFSET_KNOWN_S = 0.012
@@ -25,17 +26,22 @@ _OFFSET_STEP_S = 0.02
 FEWEST_INTERVALS = 8
 SCALE = 6  # its row of the covariance
 _ROUNDS = 8
-_LONGEST_GAP_NS = 200_000_000
 _NO_BETTER = 0.5
-_SEEN_RAD = 0.01  # of a registration, about its least known axis
-_LONG_S, _SEEN_LONG_RAD = 0.4, 0.05  # where most registrations know less: intervals over which that is as good a rate
-_MOST = 0.5
 _DEGREES = 180.0 / np.pi
 _SLOPE_S = 0.05  # each way, over which rates change: the noise of a gyroscope changes at every sample
 _LEAST_SIGMA = 0.02  # rad/s: of a mean rate between two scans by registration alone
 _FLOOR = np.array([2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 5e-3, 3e-3])  # what no number of scans averages away: registration lags
 _LED_ASTRAY = 0.02  # of what is explained, by which steps must not make it less
+_OPEN_RAD = 0.35  # standard deviation about an axis that the motion does not show
 _IDENTITY = 1e-3  # pull towards the identity, of the LiDAR's power: decides what the motion leaves open
+
+
+def turned_towards(R: NDArray[np.float64], R_other: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) R turned about a unit axis (3,) on its left as close to another rotation as that brings it."""
+    between = R @ R_other.T
+    along, across = float(axis @ between @ axis), np.trace(so3.hat(axis) @ between)
+    angle = np.arctan2(across, np.trace(between) - along)
+    return np.asarray(so3.exp(angle * axis) @ R, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +63,8 @@ class RotationFit:
         intervals: pairs of scans compared.
         covered: share of the path that these pairs span, 0 to 1.
         coarse: whether the pairs are scans farther apart, as neighbours did not know their attitudes well enough.
+        main_axis: (3,) unit, IMU frame, about which the LiDAR's rate changed most: where it turned about that alone, the mounting
+            is open about it.
     """
 
     R_imu_lidar: NDArray[np.float64]
@@ -73,6 +81,17 @@ class RotationFit:
     intervals: int
     covered: float
     coarse: bool
+    main_axis: NDArray[np.float64]
+
+    def closest_to(self, R_imu_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(3, 3) what the motion shows of the mounting, and about an axis that it leaves open as another mounting is.
+
+        Covariances are of small turns. About an open axis the estimate is any turn away from a mounting, and along axes that are
+        not quite across it, some of that turn would pass for a disagreement.
+        """
+        if np.count_nonzero(self.rotation_std[0] > _OPEN_RAD) != 1:
+            return self.R_imu_lidar
+        return turned_towards(self.R_imu_lidar, R_imu_lidar, self.main_axis)
 
     @property
     def rotation_std(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -104,7 +123,7 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
         R_expected: (3, 3) R_imu_lidar to stay close to where the motion does not tell; the identity when None.
     """
     attitude = GyroAttitude(imu.time_ns, imu.gyro)
-    pairs = _pairs(path, imu, attitude)
+    pairs = scan_pairs(path, imu, attitude)
     if len(pairs.first) < FEWEST_INTERVALS:
         return None
     begin_ns, end_ns = path.time_ns[pairs.first], path.time_ns[pairs.last]
@@ -146,7 +165,7 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
     covariance = _covariance(_without_noise_of_changes(H / variance, changes / variance, count), noise / variance, count)
     covariance += np.diag(_FLOOR**2)
     centred = rate_lidar - rate_lidar.mean(axis=0)
-    power = np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred))[::-1], 0.0)
+    power, axes = np.linalg.eigh(centred.T @ centred / len(centred))
     total = float((centred**2).sum())
     # A flipped sign is looked for with clocks as they are: at some other offset anything fits a little.
     final, unshifted = exact(offset), exact(0.0)
@@ -155,7 +174,7 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
     # Of both: a gyroscope that turns while the LiDAR rests fits no better than the other way round.
     both = float(((final - final.mean(axis=0)) ** 2).sum()) + proper.scale**2 * total
     together = max(1.0 - 2.0 * float((proper.residual**2).sum()) / max(both, 1e-12), 0.0)
-    return RotationFit(
+    fit = RotationFit(
         R,
         offset,
         scale * unit,
@@ -166,71 +185,15 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
         mirrored,
         together,
         pairs.jitter,
-        np.sqrt(power),
+        np.sqrt(np.maximum(power[::-1], 0.0)),
         len(pairs.first),
         pairs.covered,
         pairs.overlap > 1.0,
+        R @ axes[:, -1],
     )
-
-
-@dataclass(frozen=True, slots=True)
-class _Pairs:
-    """Poses `first` and `last` (K,) of a path between which rotations are compared.
-
-    Attributes:
-        overlap: how many of the intervals lie over each other, on average.
-        covered: share of the path that they span.
-        jitter: what of the rates between them changes from scan to scan without a trend [rad/s].
-    """
-
-    first: NDArray[np.intp]
-    last: NDArray[np.intp]
-    overlap: float
-    covered: float
-    jitter: float
-
-
-def _pairs(path: LidarPath, imu: ImuSamples, attitude: GyroAttitude) -> _Pairs:
-    """Neighbouring scans; where most of them do not know their attitudes well enough, scans that are farther apart."""
-    known = np.linalg.eigvalsh(path.information[:, :3, :3])[:, 0]
-    # A first pose defines the frame of its segment; of every other one all three rotations must have been seen.
-    begins = np.append(True, path.segment[1:] != path.segment[:-1])
-    seen = (known > 1.0 / _SEEN_RAD**2) | begins
-    first = np.arange(max(len(path) - 1, 0))
-    near = _covered(path, imu, attitude, first[seen[1:]], 1, 1)
-    if near.covered > _MOST or len(path) < 3:
-        return near
-    count = max(round(_LONG_S / (float(np.median(np.diff(path.time_ns))) * 1e-9)), 2)
-    seen = (known > 1.0 / _SEEN_LONG_RAD**2) | begins
-    stride = count // 2
-    first = np.arange(0, max(len(path) - count, 0), stride)
-    far = _covered(path, imu, attitude, first[seen[first] & seen[first + count]], count, stride)
-    return far if far.covered > _MOST else near
-
-
-def _covered(
-    path: LidarPath, imu: ImuSamples, attitude: GyroAttitude, first: NDArray[np.intp], count: int, stride: int
-) -> _Pairs:
-    """Poses `count` scans apart, within a segment and where the gyroscope covers what is between.
-
-    They begin with `first` (K,), some of every `stride`-th pose.
-    """
-    first = first[path.segment[first] == path.segment[first + count]]
-    begin_ns, end_ns = path.time_ns[first], path.time_ns[first + count]
-    inside = attitude.covers(begin_ns, 0.0) & attitude.covers(end_ns, 0.0) & ~_across_gap(imu.time_ns, begin_ns, end_ns)
-    first = first[inside]
-    neighbours = first if count == 1 else np.flatnonzero(path.segment[1:] == path.segment[:-1])
-    spanned = np.zeros(max(len(path) - 1, 1), dtype=bool)
-    spanned[first[:, None] + np.arange(count)] = True
-    return _Pairs(first, first + count, count / stride, float(spanned.mean()), _jitter(path, neighbours) / count)
-
-
-def _jitter(path: LidarPath, first: NDArray[np.intp]) -> float:
-    """What of the turn rates from each of some scans to the next changes without a trend [rad/s]."""
-    step_s = (path.time_ns[first + 1] - path.time_ns[first])[:, None] * 1e-9
-    rate = so3.log(np.swapaxes(path.R_path_lidar[first], 1, 2) @ path.R_path_lidar[first + 1]) / step_s
-    second = np.diff(rate, n=2, axis=0) / np.sqrt(6.0)
-    return float(np.sqrt(np.median((second**2).sum(axis=1)))) if len(second) else 0.0
+    closest = fit.closest_to(expected)
+    mean = weight @ rate_lidar / weight.sum()
+    return replace(fit, R_imu_lidar=closest, bias=unit * (bias + scale * (R - closest) @ mean))
 
 
 def _covariance(H: NDArray[np.float64], noise: NDArray[np.float64], count: float) -> NDArray[np.float64]:
@@ -282,15 +245,6 @@ def _without_noise_of_changes(H: NDArray[np.float64], added: float, count: float
     H = H.copy()
     H[7, 7] -= known - rest**2 / known
     return H
-
-
-def _across_gap(time_ns: NDArray[np.int64], begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which of the intervals [begin, end] (K,) lie, in part, between samples that are too far apart to be integrated over."""
-    gap = np.flatnonzero(np.diff(time_ns) > _LONGEST_GAP_NS)
-    across: NDArray[np.bool_] = np.zeros(len(begin_ns), dtype=np.bool_)
-    for left, right in zip(time_ns[gap], time_ns[gap + 1], strict=True):
-        across |= (begin_ns < right) & (end_ns > left)
-    return across
 
 
 class _Refined:

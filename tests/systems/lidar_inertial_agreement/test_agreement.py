@@ -31,7 +31,7 @@ def test_turns_about_a_constant_rate_contradict_a_mounting_only_where_they_are_n
     fit = RotationFit(
         R_imu_lidar=np.eye(3), offset_s=0.0, scale=1.0, bias=np.zeros(3), covariance=covariance, sigma=np.radians(0.05),
         explained=0.9, mirrored=0.86, together=0.9, sigma_registration=np.radians(0.05),
-        excitation=np.radians([0.2, 0.0, 0.0]), intervals=39, covered=1.0, coarse=False,
+        excitation=np.radians([0.2, 0.0, 0.0]), intervals=39, covered=1.0, coarse=False, main_axis=np.array([0.0, 0.0, 1.0]),
     )  # fmt: skip
     half_a_turn = so3.exp(np.array([np.radians(167.0), 0.0, 0.0]))
     assert contradicted_within(fit, half_a_turn) is None

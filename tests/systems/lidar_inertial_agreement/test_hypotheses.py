@@ -223,7 +223,8 @@ def test_points_that_may_be_mirrored_are_said_to_be(axis: int) -> None:
     covariance[:3, :3] = np.diag([1e-4, 1e-4, 1.0])
     half_turn = 2.0 * np.outer(np.eye(3)[axis], np.eye(3)[axis]) - np.eye(3)
     R = so3.exp(np.array([0.0, 0.0, 0.5])) @ T[:3, :3] @ half_turn
-    seen = replace(agreement, rotation=replace(agreement.rotation, R_imu_lidar=R, covariance=covariance), translation=None)
+    about_z = replace(agreement.rotation, R_imu_lidar=R, covariance=covariance, main_axis=np.array([0.0, 0.0, 1.0]))
+    seen = replace(agreement, rotation=about_z, translation=None)
     found = contradictions(seen, T)
     assert [finding.cause for finding in found] == ["extrinsic"]
     assert "the points are mirrored" in found[0].text

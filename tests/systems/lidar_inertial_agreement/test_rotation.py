@@ -7,13 +7,20 @@ import pytest
 
 from boxplus.manifolds import so3
 from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.systems.lidar_inertial_agreement.agreement import apart, contradicted_within
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
-from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
+from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations, turned_towards
 
 STEP_S = 0.1
 
 
-def compared(rate: np.ndarray, noise: np.ndarray, R_imu_lidar: np.ndarray, random: np.random.Generator) -> RotationFit:
+def compared(
+    rate: np.ndarray,
+    noise: np.ndarray,
+    R_imu_lidar: np.ndarray,
+    random: np.random.Generator,
+    R_expected: np.ndarray | None = None,
+) -> RotationFit:
     """Of a LiDAR that turns at `rate` (K, 3) and is registered with `noise` (K, 3), against an exact gyroscope."""
     K = len(rate)
     R = [np.eye(3)]
@@ -26,9 +33,46 @@ def compared(rate: np.ndarray, noise: np.ndarray, R_imu_lidar: np.ndarray, rando
     imu_ns = np.arange(-100_000_000, time_ns[-1] + 100_000_000, 5_000_000)
     interval = np.clip((imu_ns - 1) // round(STEP_S * 1e9), 0, K - 1)  # a sample holds until the next
     gyro = rate[interval] @ R_imu_lidar.T
-    fit = compare_rotations(path, ImuSamples(imu_ns, gyro, np.zeros_like(gyro)))
+    fit = compare_rotations(path, ImuSamples(imu_ns, gyro, np.zeros_like(gyro)), R_expected)
     assert fit is not None
     return fit
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_turns_about_one_axis_leaves_the_mounting_about_it_as_expected(seed: int) -> None:
+    """A turn that slows down, with registrations' noise a quarter of it: about that axis noise fits any mounting."""
+    random = np.random.default_rng(seed)
+    K, R_imu_lidar = 78, so3.exp(random.normal(size=3))
+    t = np.linspace(-1.0, 1.0, K)[:, None]
+    rate = np.deg2rad(4.0 * t + t**2) * np.array([0.07, 0.0, 1.0])
+    noise = np.deg2rad([[0.6, 0.45, 0.55]])
+    sound = compared(rate, noise, R_imu_lidar, random, R_imu_lidar)
+    assert np.count_nonzero(sound.rotation_std[0] > 0.35) == 1
+    assert contradicted_within(sound, R_imu_lidar) is None
+    assert np.degrees(np.linalg.norm(so3.log(sound.R_imu_lidar @ R_imu_lidar.T))) < 5.0
+    # Any turn about that axis is as good, one across it is not.
+    turned = so3.exp(random.uniform(-2.5, 2.5) * sound.main_axis) @ R_imu_lidar
+    assert contradicted_within(sound, turned) is None
+    across = np.cross(sound.main_axis, random.normal(size=3))
+    tilted = so3.exp(np.radians(40.0) * across / np.linalg.norm(across)) @ turned
+    assert contradicted_within(sound, tilted) is not None
+    np.testing.assert_allclose(np.degrees(apart(sound, tilted)[0]), 40.0, atol=8.0)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_turned_towards_another_rotation_as_close_as_an_axis_allows(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    R, R_other = so3.exp(random.normal(size=(2, 3)))
+    axis = random.normal(size=3)
+    axis /= np.linalg.norm(axis)
+
+    def angle(rotation: np.ndarray) -> float:
+        return float(np.linalg.norm(so3.log(rotation @ R_other.T)))
+
+    closest = turned_towards(R, R_other, axis)
+    np.testing.assert_allclose(np.cross(axis, so3.log(closest @ R.T)), 0.0, atol=1e-9)  # about the axis alone
+    tried = [angle(so3.exp(turn * axis) @ R) for turn in np.linspace(-np.pi, np.pi, 721)]
+    assert angle(closest) <= min(tried) + 1e-9
 
 
 @pytest.mark.parametrize("seed", range(6))
