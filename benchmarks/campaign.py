@@ -7,6 +7,7 @@
     python benchmarks/campaign.py --bag --seeds 0:20          # real bags through the real command line
     python benchmarks/campaign.py --real 20                   # real IMU and motion (needs the shared folder)
     python benchmarks/campaign.py --fast --seeds 0:40         # on roads, at up to 33 m/s
+    python benchmarks/campaign.py --odd --seeds 0:40          # LiDARs, mountings and rates on which nothing has been chosen
     python benchmarks/campaign.py --rough --seeds 0:40        # with what real recordings have besides: rain, people, lost packets
     python benchmarks/campaign.py --merge a.jsonl b.jsonl     # tables of earlier runs, nothing is run; takes --only as well
     python benchmarks/campaign.py --nightly --against runs.jsonl  # and what ended otherwise than before
@@ -85,9 +86,10 @@ def _work(options: argparse.Namespace) -> tuple[Run, list[int]] | str:
     """What to do with which seeds, or why nothing can be done."""
     begin, end = options.seeds
     if options.real is None:
-        kinds = functools.partial(draw_kinds, fast=options.fast)
+        kinds = functools.partial(draw_kinds, fast=options.fast, odd=options.odd)
         seeds = [seed for seed in range(begin, end) if kinds(seed).matches(dict(options.only))]
-        return functools.partial(run_seed, command_line=options.bag, rough=options.rough, fast=options.fast), seeds
+        how = {"command_line": options.bag, "rough": options.rough, "fast": options.fast, "odd": options.odd}
+        return functools.partial(run_seed, **how), seeds
     missing = why_not(options.shared)
     if missing is not None:
         return f"no recordings with a real IMU: {missing}"
@@ -106,10 +108,11 @@ def _runs(run: Run, seeds: Sequence[int], options: argparse.Namespace) -> Iterat
 def _crashed(seed: int, problem: BaseException, options: argparse.Namespace) -> dict[str, Any]:
     """The line of a run that ended in an exception nobody raised on purpose: a user would see a traceback."""
     seen, real = "".join(traceback.format_exception(problem)), options.real is not None
-    kinds = asdict(draw_kinds(seed, fast=options.fast))
+    kinds = asdict(draw_kinds(seed, fast=options.fast, odd=options.odd))
     if real:  # drawn with its recording, which may be what is missing
         kinds = dict.fromkeys(kinds, "unknown")
-    facts = {"seed": seed, "real": real, "rough": options.rough, "fast": options.fast, **kinds, "detail": type(problem).__name__}
+    how = {"real": real, "rough": options.rough, "fast": options.fast, "odd": options.odd}
+    facts = {"seed": seed, **how, **kinds, "detail": type(problem).__name__}
     verdict = {"verdict": "crashed", "reasons": ["no estimate"], "flags": [seen], "false_alarm": ""}
     return facts | verdict | {"worst_m": None, "falsely_weak_scans": [], "exit_code": 1, "cpu_s": 0.0}
 
@@ -124,14 +127,15 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--real", type=int, metavar="N", help="N recordings with a real IMU and motion, from the first seed on")
     parser.add_argument("--rough", action="store_true", help="with rain, people, lost packets and the like")
     parser.add_argument("--fast", action="store_true", help="on roads, at up to 33 m/s; not with --real")
+    parser.add_argument("--odd", action="store_true", help="with other LiDARs, mountings and rates of the IMU; not with --real")
     parser.add_argument("--against", type=Path, metavar="FILE", help="earlier lines of the same seeds: what ended otherwise")
     parser.add_argument("--shared", type=Path, default=_SHARED, help="folder with tools/make_lio_recording.py and data/imu")
     parser.add_argument("--out", type=Path, help="append one JSON line a run")
     parser.add_argument("--merge", type=Path, nargs="+", help="only tables, of these JSON lines")
     parser.add_argument("-v", "--verbose", action="store_true", help="all that is known about every run")
     options = parser.parse_args(arguments)
-    if options.fast and options.real is not None:
-        parser.error("--fast makes roads of its own: without --real")
+    if (options.fast or options.odd) and options.real is not None:
+        parser.error("--fast makes roads of its own, and --odd LiDARs: without --real")
     options.seeds = options.seeds or (0, _NIGHTLY if options.nightly else _SMALL)
     return options
 

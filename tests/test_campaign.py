@@ -385,7 +385,7 @@ def test_real_recordings_are_left_out_with_a_reason(campaign: SimpleNamespace, t
 def test_a_crash_is_counted_and_does_not_end_the_campaign(campaign: SimpleNamespace) -> None:
     script = importlib.import_module("campaign")
     try:
-        for how in ([], ["--fast"], ["--real", "1", "--rough"]):
+        for how in ([], ["--fast"], ["--odd"], ["--real", "1", "--rough"]):
             line = script._crashed(3, ZeroDivisionError("by nothing"), script._parse(how))
             assert "ZeroDivisionError: by nothing" in line["flags"][0]
             text = campaign.report.report([line])

@@ -14,7 +14,7 @@ from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Fault, RosetteLidar, Scenario, Simulation, SpinningLidar, faults, mounting
 from boxplus.simulation.lidar import LidarModel
 from boxplus.simulation.motions import manoeuvres
-from lio_campaign import places, roads
+from lio_campaign import places, roads, unusual
 from lio_campaign.places import Place, make_motion
 from lio_campaign.spoil import FAULT_KINDS, MOUNTING_FAULTS, READER_FAULTS, Setting, deliver, draw_spoiling
 
@@ -96,13 +96,13 @@ class _CastOnce(Simulation):
         return self._scans[index]
 
 
-def draw_kinds(seed: int, *, fast: bool = False) -> Kinds:
-    """The kinds of a seed; `fast` takes it on a road, at up to 33 m/s."""
+def draw_kinds(seed: int, *, fast: bool = False, odd: bool = False) -> Kinds:
+    """The kinds of a seed; `fast` takes it on a road, at up to 33 m/s, `odd` gives it sensors of unusual.py."""
     random = np.random.Generator(np.random.PCG64([seed, 1]))
     motions = roads.MOTIONS if fast else places.MOTIONS
     motion = str(random.choice(list(motions)))
     world = str(random.choice(motions[motion]))
-    sensor = str(random.choice(SENSORS))
+    sensor = str(random.choice(unusual.SENSORS if odd else SENSORS))
     imu = str(random.choice(list(IMU_GRADES)))
     extrinsic = str(random.choice(EXTRINSICS, p=(0.4, 0.4, 0.2)))
     fault = str(random.choice(FAULT_KINDS)) if random.uniform() < FAULTY_SHARE else "none"
@@ -113,19 +113,19 @@ def draw_kinds(seed: int, *, fast: bool = False) -> Kinds:
     return Kinds(world, motion, sensor, imu, extrinsic, fault, str(bag).lower())
 
 
-def draw(seed: int, *, fast: bool = False) -> Draw:
-    """Everything about a seed; `fast` takes it on a road, at up to 33 m/s."""
-    kinds = draw_kinds(seed, fast=fast)
+def draw(seed: int, *, fast: bool = False, odd: bool = False) -> Draw:
+    """Everything about a seed; `fast` takes it on a road, at up to 33 m/s, `odd` gives it sensors of unusual.py."""
+    kinds = draw_kinds(seed, fast=fast, odd=odd)
     random = np.random.Generator(np.random.PCG64([seed, 2]))
     place = (roads.PLACES if fast else places.PLACES)[kinds.world](random)
-    lidar, duration_s = _lidar(kinds.sensor, random)
+    lidar, duration_s = (unusual.lidar if odd else _lidar)(kinds.sensor, random)
     trajectory = (roads.fast_motion if fast else make_motion)(kinds.motion, kinds.world, place, duration_s, random)
     duration_s = min(duration_s, trajectory.duration_s)
-    imu = draw_imu(kinds.imu, _IMU_RATES_HZ, random)
+    imu = draw_imu(kinds.imu, unusual.IMU_RATES_HZ if odd else _IMU_RATES_HZ, random)
     if kinds.motion == "vibration":
         strength, hz = random.uniform(0.7, 1.3), random.uniform(55.0, 90.0)
         imu = imu.model_copy(update={"accel_vibration": strength, "gyro_vibration": 0.02 * strength, "vibration_hz": hz})
-    T_imu_lidar = _mounting(kinds.extrinsic == "absent", random)
+    T_imu_lidar = (unusual.any_mounting if odd else _mounting)(kinds.extrinsic == "absent", random)
     scenario = Scenario(f"campaign {seed}", place.world, trajectory, lidar, imu, T_imu_lidar)
     bag, file_format = kinds.bag == "true", str(random.choice(("ros2", "ros1")))
     begin_s = float(random.uniform(4.0, 0.6 * duration_s))

@@ -44,7 +44,9 @@ _POINTS_LOOKED_AT = 500
 _COMMAND = (sys.executable, "-c", "from boxplus.cli import main; main()", "lio")
 
 
-def run_seed(seed: int, *, command_line: bool = False, rough: bool = False, fast: bool = False) -> dict[str, Any]:
+def run_seed(
+    seed: int, *, command_line: bool = False, rough: bool = False, fast: bool = False, odd: bool = False
+) -> dict[str, Any]:
     """Everything about one seed, as a line of JSON.
 
     Args:
@@ -52,9 +54,10 @@ def run_seed(seed: int, *, command_line: bool = False, rough: bool = False, fast
         command_line: write a bag and run the real `boxplus lio` in a process of its own.
         rough: with what real recordings have besides, see nuisances.py.
         fast: on a road, see roads.py.
+        odd: with sensors and mountings on which nothing has been chosen, see unusual.py.
     """
     clock = _Clock()
-    made = draw(seed, fast=fast)
+    made = draw(seed, fast=fast, odd=odd)
     simulation = made.truth()
     lidar = simulation.scenario.lidar
     elevation = getattr(lidar, "vertical_fov_deg", (0.0, 0.0))
@@ -72,7 +75,7 @@ def run_seed(seed: int, *, command_line: bool = False, rough: bool = False, fast
     suspects: list[dict[str, float]] = []
     if _looked_at(made) and outcome.estimate is not None:
         suspects = falsely_weak(outcome.estimate, simulation)
-    facts = {"seed": seed, "real": False, "rough": rough, "fast": fast, **_drawn(made)}
+    facts = {"seed": seed, "real": False, "rough": rough, "fast": fast, "odd": odd, **_drawn(made)}
     if command_line:
         facts["bag"] = "command"
     return facts | _judged(made, outcome, simulation, suspects) | clock.read()
@@ -95,7 +98,7 @@ def run_real(seed: int, shared: Path, *, rough: bool = False) -> dict[str, Any]:
             made = _roughened(made, *draw_nuisances(scene, seed))
         outcome = _in_process(lambda options: opened_real(made, options), made, work)
         truth = made.truth()
-    facts = {"seed": seed, "real": True, "rough": rough, "fast": False, **_drawn(made)}
+    facts = {"seed": seed, "real": True, "rough": rough, "fast": False, "odd": False, **_drawn(made)}
     return facts | _judged(made, outcome, truth, []) | clock.read()
 
 

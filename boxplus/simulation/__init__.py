@@ -2,7 +2,7 @@
 
 from boxplus.simulation.faults import FAULTS, Fault, make_fault
 from boxplus.simulation.imu import ImuModel
-from boxplus.simulation.lidar import RosetteLidar, SpinningLidar
+from boxplus.simulation.lidar import OmniLidar, RosetteLidar, SpinningLidar
 from boxplus.simulation.live_recording import as_recording
 from boxplus.simulation.motions.spline import Motion, SplineTrajectory, Trajectory
 from boxplus.simulation.motions.thrust import ThrustTrajectory
@@ -19,6 +19,7 @@ __all__ = [
     "ImuModel",
     "Motion",
     "MountedLidar",
+    "OmniLidar",
     "RosetteLidar",
     "Scenario",
     "Simulation",

@@ -80,7 +80,34 @@ class RosetteLidar(_Lidar):
         return np.zeros(len(p_lidar), np.uint16)
 
 
-LidarModel = Annotated[SpinningLidar | RosetteLidar, Field(discriminator="kind")]
+class OmniLidar(_Lidar):
+    """A LiDAR that looks all around, mostly up, and draws a figure that never repeats (Livox Mid-360).
+
+    One ray swings up and down at an even speed while it turns about z.
+    """
+
+    kind: Literal["omni"] = "omni"
+    points_per_scan: int = Field(20000, ge=1, description="rays per scan")
+    vertical_fov_deg: tuple[float, float] = Field((-7.0, 52.0), description="elevation of the lowest and highest ray [deg]")
+    turns_hz: float = Field(19.3718, gt=0, description="turns about z per second")
+    swings_hz: float = Field(517.2911, gt=0, description="swings up and down again per second")
+
+    def rays(self, scan_index: int) -> Rays:
+        """The rays of a scan; every scan continues the figure of the one before."""
+        offset_s = np.arange(1, self.points_per_scan + 1) / (self.points_per_scan * self.rate_hz)
+        time = scan_index / self.rate_hz + offset_s
+        azimuth = 2.0 * np.pi * np.mod(self.turns_hz * time, 1.0)
+        low, high = np.deg2rad(self.vertical_fov_deg)
+        elevation = low + (high - low) * np.abs(2.0 * np.mod(self.swings_hz * time, 1.0) - 1.0)
+        level = np.cos(elevation)
+        return Rays(offset_s, np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1))
+
+    def ring(self, p_lidar: NDArray[np.float32]) -> NDArray[np.uint16]:
+        """Zero (N,): one laser draws the whole figure."""
+        return np.zeros(len(p_lidar), np.uint16)
+
+
+LidarModel = Annotated[SpinningLidar | RosetteLidar | OmniLidar, Field(discriminator="kind")]
 
 
 @functools.lru_cache(maxsize=4)

@@ -12,7 +12,7 @@ from boxplus._settings import suggestion
 from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.simulation.imu import ImuModel
-from boxplus.simulation.lidar import LidarModel, RosetteLidar, SpinningLidar
+from boxplus.simulation.lidar import LidarModel, OmniLidar, RosetteLidar, SpinningLidar
 from boxplus.simulation.motions import trajectories
 from boxplus.simulation.motions.spline import SplineTrajectory, Trajectory
 from boxplus.simulation.worlds import worlds
@@ -43,7 +43,7 @@ class Scenario:
     name: str
     world: World
     trajectory: Trajectory
-    lidar: SpinningLidar | RosetteLidar = field(default_factory=SpinningLidar)
+    lidar: SpinningLidar | RosetteLidar | OmniLidar = field(default_factory=SpinningLidar)
     imu: ImuModel = field(default_factory=ImuModel)
     T_imu_lidar: NDArray[np.float64] = field(default_factory=lambda: mounting(1.5, -2.0, 25.0, (0.06, -0.03, 0.11)))
 

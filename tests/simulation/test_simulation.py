@@ -10,7 +10,16 @@ import pytest
 from boxplus.errors import InputError
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
-from boxplus.simulation import SCENARIOS, RosetteLidar, Simulation, SpinningLidar, make_scenario, mounting, simulate
+from boxplus.simulation import (
+    SCENARIOS,
+    OmniLidar,
+    RosetteLidar,
+    Simulation,
+    SpinningLidar,
+    make_scenario,
+    mounting,
+    simulate,
+)
 from tests.simulation.small_simulations import small
 
 QUICK = [name for name in SCENARIOS if name != "drive30"]
@@ -100,6 +109,21 @@ def test_a_rosette_stays_in_its_field_and_never_repeats() -> None:
         assert rays.directions_lidar[:, 0].min() >= np.cos(np.deg2rad(20.0)) - 1e-12
     assert np.abs(first.directions_lidar - second.directions_lidar).max() > 0.1
     assert 0.0 < first.offset_s[0] < first.offset_s[-1] <= 0.1
+
+
+def test_an_omni_lidar_looks_all_around_between_its_elevations_and_never_repeats() -> None:
+    lidar = OmniLidar(points_per_scan=4000, vertical_fov_deg=(-7.0, 52.0))
+    first, second = lidar.rays(0), lidar.rays(1)
+    for rays in (first, second):
+        x, y, z = rays.directions_lidar.T
+        np.testing.assert_allclose(np.linalg.norm(rays.directions_lidar, axis=1), 1.0, atol=1e-12)
+        elevation, azimuth = np.degrees(np.arcsin(z)), np.degrees(np.arctan2(y, x))
+        assert -7.0 - 1e-9 <= elevation.min() < -6.0 and 51.0 < elevation.max() <= 52.0 + 1e-9
+        np.testing.assert_allclose(np.histogram(azimuth, 12, (-180.0, 180.0))[0], 4000 / 12, rtol=0.2)
+        np.testing.assert_allclose(np.histogram(elevation, 8, (-7.0, 52.0))[0], 4000 / 8, rtol=0.1)  # swings evenly
+    assert np.abs(first.directions_lidar - second.directions_lidar).max() > 0.1
+    assert 0.0 < first.offset_s[0] < first.offset_s[-1] <= 0.1
+    assert not lidar.ring(np.zeros((3, 3), np.float32)).any()
 
 
 def test_rings_are_found_from_the_points() -> None:

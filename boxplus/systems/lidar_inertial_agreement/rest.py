@@ -20,6 +20,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.shifted_scans import shifts_show
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns
 from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surfaces_across
 
@@ -91,6 +92,8 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
     open_axes = axes[:, ~seen].T
     if at_rest and seen.all() and not faces(path, scans, config, axes[:, 0]):
         open_axes = axes[:, :1].T
+    if at_rest and len(open_axes) == 1 and shifts_show(scans, open_axes[0], config):
+        open_axes = open_axes[:0]
     return Rest(at_rest, open_axes, not_shown.T, speed, rate)
 
 

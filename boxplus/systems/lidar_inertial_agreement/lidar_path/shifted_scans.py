@@ -1,0 +1,57 @@
+"""Whether scans of a LiDAR at rest would fit one another worse, had it moved along an axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.nav_state import NavState, P
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_measurement import PlaneMeasurement
+from boxplus.maps.registration_config import RegistrationConfig
+from boxplus.sensors.lidar.downsampling import VoxelFilter
+from boxplus.sensors.lidar.scan import Scan
+
+_COMPARED, _POINTS, _FEWEST = 3, 3000, 100  # scans at either end, points of one, and fewer of them say nothing
+_NEAR_M = 3.0  # what goes along with a LiDAR, a mast or who carries it, is nearer: it fits at rest whatever moves
+_SHIFTS_M = (0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8)  # within the first second: less is no motion of a vehicle
+_WORSE = 1.4  # times the cost; rings that lie askew on a smooth tunnel reach 1.3 at the least of these shifts
+
+
+def shifts_show(scans: Sequence[Scan], axis: NDArray[np.float64], config: RegistrationConfig) -> bool:
+    """Whether the last scans fit the first ones unmoved, and clearly worse at any shift along an axis.
+
+    Where surfaces that face it are hard to tell, as among stems and leaves, a shift still leaves everything beside its place.
+    Along a tunnel or a street between smooth walls the scans fit as well.
+
+    Args:
+        scans: some that may all have been taken from one place.
+        axis: (3,) unit vector in the LiDAR's frame.
+        config: of the LiDAR's noise and the sizes of cells.
+    """
+    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
+    voxel_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), _POINTS)
+    for scan in scans[:_COMPARED]:
+        tree.insert(voxel_filter(scan.p_lidar)[1].astype(np.float64), downsample=True)
+    measurements = []
+    for scan in scans[-_COMPARED:]:
+        points = voxel_filter(scan.p_lidar)[0]
+        points = points[np.linalg.norm(points, axis=1) > _NEAR_M]
+        if len(points) < _FEWEST:
+            return False
+        measurements.append(PlaneMeasurement(points, tree, config, with_extrinsic=False))
+    unmoved = _cost(measurements, np.zeros(3), config)
+    return all(_cost(measurements, sign * shift * axis, config) > _WORSE * unmoved for shift in _SHIFTS_M for sign in (1.0, -1.0))
+
+
+def _cost(measurements: Sequence[PlaneMeasurement], shift: NDArray[np.float64], config: RegistrationConfig) -> float:
+    """Mean square of the residuals of scans that are shifted (3,) [m²]; points on no plane count as far off."""
+    x, cost = NavState.identity().pack(), 0.0
+    x[P : P + 3] = shift
+    for measurement in measurements:
+        fit = measurement.at(x, rematch=True)
+        used = fit.used / measurement.points
+        cost += used * fit.residual_rms**2 + (1.0 - used) * config.plane_threshold**2
+    return cost

@@ -1,0 +1,56 @@
+"""Sensors and mountings of the campaign on which nothing has been chosen."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+SEEDS = range(150)
+
+
+@pytest.fixture(scope="module")
+def campaign() -> Iterator[SimpleNamespace]:
+    sys.path.insert(0, str(FOLDER))
+    try:
+        yield SimpleNamespace(**{name: importlib.import_module(f"lio_campaign.{name}") for name in ("draws", "unusual")})
+    finally:
+        sys.path.remove(str(FOLDER))
+        for name in [name for name in sys.modules if name.partition(".")[0] == "lio_campaign"]:
+            del sys.modules[name]
+
+
+def test_every_sensor_is_drawn_and_sees_something(campaign: SimpleNamespace) -> None:
+    kinds = [campaign.draws.draw_kinds(seed, odd=True) for seed in SEEDS]
+    assert set(Counter(kind.sensor for kind in kinds)) == set(campaign.unusual.SENSORS)
+    for sensor in campaign.unusual.SENSORS:
+        wanted = {"sensor": sensor, "world": "hall", "fault": "none"}
+        seed = next(seed for seed in range(5000) if campaign.draws.draw_kinds(seed, odd=True).matches(wanted))
+        made = campaign.draws.draw(seed, odd=True)
+        assert len(made.truth().scan(0)) > 1000
+        assert made.scenario.imu.rate_hz in campaign.unusual.IMU_RATES_HZ
+
+
+def test_nothing_else_of_the_usual_draws_changes(campaign: SimpleNamespace) -> None:
+    usual, odd = campaign.draws.draw_kinds(7), campaign.draws.draw_kinds(7, odd=True)
+    assert usual.sensor in campaign.draws.SENSORS
+    assert (usual.world, usual.motion) == (odd.world, odd.motion)
+
+
+def test_lidars_hang_askew_lie_and_stand(campaign: SimpleNamespace) -> None:
+    random = np.random.default_rng(0)
+    mountings = np.array([campaign.unusual.any_mounting(False, random) for _ in range(400)])
+    R = mountings[:, :3, :3]
+    np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(3), (400, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(R), 1.0)
+    tilt = np.degrees(np.arccos(np.clip(R[:, 2, 2], -1.0, 1.0)))
+    assert 0.15 < np.mean(tilt < 1e-3) < 0.35  # upright
+    assert 0.4 < np.mean((tilt > 14.9) & (tilt < 60.1)) < 0.7
+    assert 0.08 < np.mean(tilt > 90.0) < 0.2  # upside down
