@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -96,7 +97,11 @@ class Simulation:
             InputError: no such scan.
         """
         points, time_ns, reflectivity = self._cast(index, self.scenario.lidar.range_sigma_m)
-        return Scan.from_arrays(points.astype(np.float32), time_ns, (255.0 * reflectivity).astype(np.float32))
+        scan = Scan.from_arrays(points.astype(np.float32), time_ns, (255.0 * reflectivity).astype(np.float32))
+        if len(scan):
+            return scan
+        begin_ns = self.scan_start_ns(index)  # of rays that all meet nothing
+        return replace(scan, start_ns=begin_ns + 1, end_ns=begin_ns + self._scan_ns)
 
     def exact_points(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """The points of scan `index` without noise: (N, 3) float64 in the LiDAR frame [m], and their times (N,) [ns]."""
@@ -171,8 +176,6 @@ def simulate(
         >>> sum(isinstance(event, bp.Scan) for event in simulation), simulation.T_imu_lidar.shape
         (9, (4, 4))
     """
-    from dataclasses import replace
-
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError("seed as an integer from 0", shown(seed), "leave it out for 0")
     chosen = make_scenario(scenario, seed) if isinstance(scenario, str) else scenario

@@ -153,3 +153,12 @@ def test_refused() -> None:
         simulate("at_rest", T_imu_lidar=2.0 * np.eye(4))
     with pytest.raises(InputError, match="a scan from 0 to 98 – got 99"):
         simulate("at_rest").scan(99)
+
+
+def test_a_scan_that_meets_nothing_has_its_times() -> None:
+    up = RosetteLidar(fov_deg=20.0, points_per_scan=50)
+    simulation = small("walk", lidar=up, T_imu_lidar=mounting(0.0, -90.0, 0.0, (0.0, 0.0, 0.0)))
+    for index in (0, 3):
+        scan = simulation.scan(index)
+        assert len(scan) == 0
+        assert simulation.scan_start_ns(index) < scan.start_ns < scan.end_ns == simulation.scan_start_ns(index + 1)
