@@ -2,7 +2,8 @@
 
 Trunks, columns and pipes are about as thick as a cell of the map is wide. A plane through five points of one is a chord, which
 lies inside the surface by a good part of its misfit, and points of the next scan lie before it. A LiDAR that looks one way sees
-only one side of all of them, so that every scan is pushed the same way, by centimetres, and none contradicts another.
+only one side of all of them, so that every scan is pushed the same way, by centimetres, and none contradicts another. Of such
+a LiDAR planes are bent where the map is sparser, too.
 
 A height over the plane of the five is laid through the fifteen nearest map points,
 
@@ -37,6 +38,12 @@ MEAN_LEVERAGE = 0.3  # times the mean: planes on which less hangs stay as they a
 # On a surface whose cells are all filled, the 15th neighbour of a point lies 2.2 cells away. Farther apart are the lines of
 # scans, between which nothing is known of a curvature.
 FILLED_CELLS = 2.5
+# A LiDAR that sees one way: the mean of the unit vectors towards its points is longer than that over a cone of 133 degrees. Its
+# chords do not even out, and its points lie scattered: where as little as a third of the cells is filled, and on planes of less
+# leverage, patches are still nearer to the surface than chords.
+ONE_WAY = 0.7
+SPARSE_CELLS = 4.0
+LITTLE_LEVERAGE = 0.1
 
 
 @kernel

@@ -26,7 +26,15 @@ from boxplus.filtering.plane_information import (
     accumulate_parts,
 )
 from boxplus.filtering.small_linalg import cholesky_inverse_into
-from boxplus.maps.curved_patches import FILLED_CELLS, MEAN_LEVERAGE, PATCH, bend_planes
+from boxplus.maps.curved_patches import (
+    FILLED_CELLS,
+    LITTLE_LEVERAGE,
+    MEAN_LEVERAGE,
+    ONE_WAY,
+    PATCH,
+    SPARSE_CELLS,
+    bend_planes,
+)
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
 from boxplus.maps.plane_confirmation import CONFIRMING, DENSE_CELLS, LEVERAGE, confirm_planes
@@ -55,6 +63,8 @@ class PlaneMeasurement:
         weight: factor of the information, below 1 where the points are not where they seem.
         confirm: whether planes on which something hangs are held against more of the map: false ones are refused
             (`plane_confirmation`), curved ones bent (`curved_patches`).
+        bend_sparse: whether more of them are, where the map is sparser, if the sensor sees one way only. For those who
+            have a prediction: registrations that nothing else steadies do without.
 
     Attributes:
         lever_arm: root mean square distance of the points from the LiDAR [m], 0.1 at least.
@@ -70,6 +80,7 @@ class PlaneMeasurement:
         with_extrinsic: bool,
         weight: float = 1.0,
         confirm: bool = False,
+        bend_sparse: bool = False,
     ) -> None:
         n = len(p_lidar)
         self._p_lidar = p_lidar
@@ -89,6 +100,7 @@ class PlaneMeasurement:
         self._directions: PoseDirections
         self.facing: NDArray[np.float64] = np.zeros(3)
         self.lever_arm = max(_spread_into(p_lidar, self.facing) if n else 1.0, 0.1)
+        self._bend_sparse = bend_sparse and math.hypot(*self.facing) > ONE_WAY
 
     def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
         """The information at the packed state x (36,); `rematch` searches the neighbours anew."""
@@ -187,6 +199,7 @@ class PlaneMeasurement:
             np.zeros(CONFIRMING, dtype=np.float32),
             np.zeros(STACK_DEPTH + CONFIRMING, dtype=STACK),
         )
+        leverage, cells = (LITTLE_LEVERAGE, SPARSE_CELLS) if self._bend_sparse else (MEAN_LEVERAGE, FILLED_CELLS)
         which, bent = np.empty(self.points, dtype=np.int64), np.empty((self.points, PLANE))
         count = bend_planes(
             self._tree.view(),
@@ -194,8 +207,8 @@ class PlaneMeasurement:
             x,
             self._p_lidar,
             covariance,
-            MEAN_LEVERAGE * mean_leverage,
-            (FILLED_CELLS * self._cell) ** 2,
+            leverage * mean_leverage,
+            (cells * self._cell) ** 2,
             self._cell,
             config.map_sigma**2,
             self._planes,

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from boxplus.filtering.iterated_update import Information
 from boxplus.filtering.nav_state import NavState
 from boxplus.filtering.plane_information import NOT_A_PLANE, USED
 from boxplus.manifolds import so3
@@ -167,3 +169,46 @@ def test_a_measurement_adds_up_the_patches_it_keeps() -> None:
     np.testing.assert_allclose(matched.b, kept.b, rtol=1e-9, atol=1e-6 * np.abs(kept.b).max())
     assert matched.used == kept.used
     assert np.abs(matched.A - plain.A)[3:5, 3:5].max() > 0.01 * plain.A[3, 3]
+
+
+def _bushes(seed: int, sides: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a map whose cells of 0.25 m are filled by half, and of a scan from the origin: 40 balls on each of `sides`."""
+    random = np.random.default_rng(seed)
+    both: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    for ball in range(40 * sides):
+        radius, distance = random.uniform(0.6, 1.2), random.uniform(8.0, 14.0)
+        aside = random.uniform(-0.7, 0.7) + 2.0 * np.pi * (ball % sides) / sides
+        centre = distance * np.array([np.cos(aside), np.sin(aside), random.uniform(-0.2, 0.2)])
+        for seen in both:
+            normals = random.normal(size=(int(7.0 * 4.0 * np.pi * radius**2), 3))
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            points = centre + radius * normals
+            seen.append(points[np.sum(normals * points, axis=1) < -0.3 * np.linalg.norm(points, axis=1)])
+    return np.concatenate(both[0]), np.concatenate(both[1])
+
+
+def _information(seed: int, sides: int, *, bend_sparse: bool) -> Information:
+    """What a scan of bushes says at its true pose."""
+    stored, seen = _bushes(seed, sides)
+    tree = IkdTree(stored, cell_size=0.25)
+    measurement = PlaneMeasurement(
+        seen.astype(np.float32), tree, RegistrationConfig(), with_extrinsic=False, confirm=True, bend_sparse=bend_sparse
+    )
+    return measurement.at(NavState.identity().pack(), rematch=True)
+
+
+@settings(max_examples=10)
+@given(seeds)
+def test_a_sparse_map_of_bushes_pushes_a_sensor_that_looks_one_way_the_less(seed: int) -> None:
+    def push(said: Information) -> float:
+        return float(-np.linalg.solve(said.A[:6, :6], said.b[:6])[3])
+
+    chords, patches = (push(_information(seed, 1, bend_sparse=sparse)) for sparse in (False, True))
+    assert chords > 0.01  # towards the bushes
+    assert abs(patches) < 0.5 * chords
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_for_a_sensor_that_looks_around_a_sparse_map_changes_no_bit(seed: int) -> None:
+    plain, sparse = (_information(seed, 4, bend_sparse=wanted) for wanted in (False, True))
+    assert plain.A.tobytes() == sparse.A.tobytes() and plain.b.tobytes() == sparse.b.tobytes()

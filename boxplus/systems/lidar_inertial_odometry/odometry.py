@@ -338,7 +338,9 @@ class LidarInertialOdometry(Snapshots):
     def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:
         with_extrinsic = self.config.extrinsic_estimation != "off"
         weight = _BLIND_WEIGHT if self._is_blind(frame) else 1.0
-        return PlaneMeasurement(points, self.map, self.config, with_extrinsic=with_extrinsic, weight=weight, confirm=True)
+        return PlaneMeasurement(
+            points, self.map, self.config, with_extrinsic=with_extrinsic, weight=weight, confirm=True, bend_sparse=True
+        )
 
     def _is_blind(self, frame: Frame) -> bool:
         return frame.largest_gap_s > self.config.max_imu_gap
