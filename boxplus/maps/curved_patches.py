@@ -10,8 +10,9 @@ A height over the plane of the five is laid through the fifteen nearest map poin
     η(e, f) = a + b e + c f + ½ (d e² + 2 g e f + k f²),    variance of a point  σ² exp(r²/s²),    d, √2 g, k ~ N(0, 1/s²)
 
 with e and f from the point itself: least squares that trust what is near (Cleveland, JASA 1979; Levin, Math. Comp. 1998), with
-surfaces taken to bend by radii of about a cell, s, or wider. What it leaves, and how well it is determined, say how far to
-believe it; it counts where it fits the fifteen better than the plane its five.
+surfaces taken to bend by radii of about a cell, s, or wider. Where the map is sparser, points count from farther away, and s of
+the variance grows, that of the curvature does not. What it leaves, and how well it is determined, say how far to believe it; it
+counts where it fits the fifteen better than the plane its five.
 
 Source: docs/lidar_inertial_odometry.md, section 5.
 """
@@ -39,11 +40,10 @@ MEAN_LEVERAGE = 0.3  # times the mean: planes on which less hangs stay as they a
 # scans, between which nothing is known of a curvature.
 FILLED_CELLS = 2.5
 # A LiDAR that sees one way: the mean of the unit vectors towards its points is longer than that over a cone of 133 degrees. Its
-# chords do not even out, and its points lie scattered: where as little as a third of the cells is filled, and on planes of less
-# leverage, patches are still nearer to the surface than chords.
+# chords do not even out, and its points lie scattered: where as little as a third of the cells is filled, patches are still
+# nearer to the surface than chords.
 ONE_WAY = 0.7
 SPARSE_CELLS = 4.0
-LITTLE_LEVERAGE = 0.1
 
 
 @kernel
@@ -73,7 +73,8 @@ def bend_planes(
         covariance: (6, 6) of the pose [θ, p] from all planes.
         least_leverage: of a plane that is looked at.
         max_distance_sq: squared distance within which neighbours are looked for [m²].
-        reach: s, where points count less, and the radius that surfaces bend by [m].
+        reach: s, where points count less, and the radius that surfaces bend by [m]. Where the last of the fifteen is farther away
+            than on a filled map, points count as much farther.
         map_variance: of a map point along the normal, as the settings have it [m²].
         planes: (n, PLANE) records of `plane_matching`, with their weights; fate: (n,). Both stay as they are.
         which: (n,) receives the planes that are to be replaced, bent: (n, PLANE) what by.
@@ -97,7 +98,8 @@ def bend_planes(
         if found < PATCH:
             continue
         copy_found(view, stack, PATCH, PATCH, near)
-        if _fit_patch(near, y, planes[n], reach, map_variance, heights, rows, square, sums, bent[count]):
+        wider = max(1.0, math.sqrt(np.float64(found_sq[PATCH - 1])) / (FILLED_CELLS * reach))
+        if _fit_patch(near, y, planes[n], reach, wider * reach, map_variance, heights, rows, square, sums, bent[count]):
             for offset, g in ((3, 0), (8, 5), (12, 9)):
                 for i in range(3):
                     bent[count, offset] += bent[count, g + i] * origin[i]
@@ -111,6 +113,7 @@ def _fit_patch(
     near: NDArray[np.float32],
     y: NDArray[np.float64],
     plane: NDArray[np.float64],
+    radius: float,
     reach: float,
     map_variance: float,
     heights: NDArray[np.float64],
@@ -146,7 +149,7 @@ def _fit_patch(
             right[i] += weighted * height
             for k in range(i + 1):
                 A[i, k] += weighted * row[k]
-    prior = map_variance * reach * reach
+    prior = map_variance * radius * radius
     A[3, 3] += prior
     A[4, 4] += 2.0 * prior  # then it does not matter which way e and f lie
     A[5, 5] += prior

@@ -26,15 +26,7 @@ from boxplus.filtering.plane_information import (
     accumulate_parts,
 )
 from boxplus.filtering.small_linalg import cholesky_inverse_into
-from boxplus.maps.curved_patches import (
-    FILLED_CELLS,
-    LITTLE_LEVERAGE,
-    MEAN_LEVERAGE,
-    ONE_WAY,
-    PATCH,
-    SPARSE_CELLS,
-    bend_planes,
-)
+from boxplus.maps.curved_patches import FILLED_CELLS, MEAN_LEVERAGE, ONE_WAY, PATCH, SPARSE_CELLS, bend_planes
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
 from boxplus.maps.plane_confirmation import CONFIRMING, DENSE_CELLS, LEVERAGE, confirm_planes
@@ -199,7 +191,7 @@ class PlaneMeasurement:
             np.zeros(CONFIRMING, dtype=np.float32),
             np.zeros(STACK_DEPTH + CONFIRMING, dtype=STACK),
         )
-        leverage, cells = (LITTLE_LEVERAGE, SPARSE_CELLS) if self._bend_sparse else (MEAN_LEVERAGE, FILLED_CELLS)
+        cells = SPARSE_CELLS if self._bend_sparse else FILLED_CELLS
         which, bent = np.empty(self.points, dtype=np.int64), np.empty((self.points, PLANE))
         count = bend_planes(
             self._tree.view(),
@@ -207,7 +199,7 @@ class PlaneMeasurement:
             x,
             self._p_lidar,
             covariance,
-            leverage * mean_leverage,
+            MEAN_LEVERAGE * mean_leverage,
             (cells * self._cell) ** 2,
             self._cell,
             config.map_sigma**2,

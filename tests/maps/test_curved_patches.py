@@ -11,7 +11,7 @@ from boxplus.filtering.iterated_update import Information
 from boxplus.filtering.nav_state import NavState
 from boxplus.filtering.plane_information import NOT_A_PLANE, USED
 from boxplus.manifolds import so3
-from boxplus.maps.curved_patches import PATCH, bend_planes
+from boxplus.maps.curved_patches import FILLED_CELLS, PATCH, bend_planes
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
 from boxplus.maps.plane_matching import PLANE, WEIGHT
@@ -71,7 +71,8 @@ def _reference(y: np.ndarray, near: np.ndarray, u: np.ndarray) -> tuple[np.ndarr
     d = near - y
     e, f = d @ basis[0], d @ basis[1]
     B = np.stack([np.ones(PATCH), e, f, 0.5 * e * e, e * f, 0.5 * f * f], axis=1)
-    w = np.exp(-np.sum(d * d, axis=1) / REACH_M**2)
+    reach = max(REACH_M, np.linalg.norm(d, axis=1).max() / FILLED_CELLS)
+    w = np.exp(-np.sum(d * d, axis=1) / reach**2)
     C = np.linalg.inv(B.T @ (w[:, None] * B) + np.diag([0.0] * 3 + [1.0, 2.0, 1.0]) * (SIGMA_M * REACH_M) ** 2)
     solution = C @ B.T @ (w * (d @ u))
     variance = w @ (d @ u - B @ solution) ** 2 / w.sum() * PATCH / (PATCH - 6)
@@ -81,11 +82,11 @@ def _reference(y: np.ndarray, near: np.ndarray, u: np.ndarray) -> tuple[np.ndarr
 
 
 @settings(max_examples=30)
-@given(seeds, st.floats(0.15, 1.0))
-def test_against_numpy(seed: int, radius: float) -> None:
+@given(seeds, st.floats(0.15, 1.0), st.sampled_from([25, 60, 120]))
+def test_against_numpy(seed: int, radius: float, count: int) -> None:
     random = np.random.default_rng(seed)
     origin = np.array([500.0, -200.0, 30.0])
-    stored = _column(random, radius, 60, noise_m=0.01)[0].astype(np.float32).astype(np.float64)
+    stored = _column(random, radius, count, noise_m=0.01)[0].astype(np.float32).astype(np.float64)
     tree = IkdTree(stored + origin)
     stored = tree.points() - origin
     points = _column(random, radius, 20)[0]
