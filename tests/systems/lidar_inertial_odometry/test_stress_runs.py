@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus.simulation import Scenario, SpinningLidar
+from boxplus.simulation import RosetteLidar, Scenario, SpinningLidar
 from boxplus.simulation.imu import ImuModel
-from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import sites
 from tests.systems.lidar_inertial_odometry.simulated_runs import run
 
@@ -51,3 +51,12 @@ def test_steps_do_not_hold_the_height_back() -> None:
     assert stairs.odometry.map.cell_size == 0.5 * stairs.odometry.config.map_cell
     assert stairs.distance.max() < 0.05
     assert set(stairs.status) == {"ok"}
+
+
+def test_trunks_do_not_push_a_rosette_along_its_view() -> None:
+    # Where the map is sparse, planes through five points of a trunk are chords within it: 3.6 cm within 8 s.
+    drive = trajectories.drive(((-36.0, 0.0), (36.0, 0.0)), 4.0, 1.6, 1.5)
+    lidar = RosetteLidar(points_per_scan=6000, fov_deg=80.0)
+    woods = run(Scenario("woods", sites.forest(), drive, lidar, ImuModel(), np.eye(4)), 8.0)
+    assert set(woods.status) == {"ok"}
+    assert woods.distance.max() < 0.03
