@@ -47,10 +47,11 @@ def likely_causes(
     compared = _compared(info, events, cameras, around_ns, views)
     if compared is None:
         return []
-    comparison, imu = compared
+    comparison, imu, origin_ns = compared
     pictures = _pictures(info, cameras)
     found = [finding for camera in pictures for finding in _of_images(camera.name, views[camera.index])]
     found += check_corners(pictures[0].name, comparison.turns.followed, views[pictures[0].index])
+    found += comparison.of_view(origin_ns)
     if len(pictures) > 1:
         found.append(check_synchronisation(pictures[:2], [views[camera.index].time_ns for camera in pictures[:2]]))
     found += comparison.of_cameras()
@@ -69,7 +70,7 @@ def calibration_doubts(info: CameraRecordingInfo, events: Iterator[CameraEvent],
     compared = _compared(info, events, 1, around_ns, {})
     if compared is None or not len(compared[1]):
         return []
-    comparison, imu = compared
+    comparison, imu, _ = compared
     doubtful = [finding for finding in comparison.with_imu(imu) if finding.key.endswith(_CALIBRATION)]
     return [sentence(finding) for finding in _wrong(doubtful)]
 
@@ -80,8 +81,8 @@ def _pictures(info: CameraRecordingInfo, cameras: int) -> list[CameraStream]:
 
 def _compared(
     info: CameraRecordingInfo, events: Iterator[CameraEvent], cameras: int, around_ns: int | None, views: Mapping[int, Views]
-) -> tuple[Comparison, ImuSamples] | None:
-    """The first cameras around an instant, and the samples there; None where the recording cannot be read.
+) -> tuple[Comparison, ImuSamples, int] | None:
+    """The first cameras around an instant, the samples there, and when the recording begins [ns]; None where it cannot be read.
 
     Args:
         views: of each camera, where its images are to be noted as well.
@@ -89,12 +90,13 @@ def _compared(
     pictures = _pictures(info, cameras)
     rate_hz = pictures[0].count / max(info.duration_s, 1e-3)
     compared = Comparison(pictures, min(pictures[0].count, round(rate_hz * (BEFORE_S + _AFTER_S))))
-    begin_ns = None
+    begin_ns, origin_ns = None, 0
     to_8_bits, imu = EightBits(), []
     try:
         for event in events:
             time_ns = int(event.time_ns[0]) if isinstance(event, ImuSamples) else event.time_ns
             if begin_ns is None:
+                origin_ns = time_ns
                 begin_ns = time_ns if around_ns is None else max(time_ns, around_ns - round(1e9 * BEFORE_S))
                 end_ns = begin_ns + round(1e9 * (BEFORE_S + _AFTER_S))
             if time_ns > end_ns + _MARGIN_NS:
@@ -109,7 +111,7 @@ def _compared(
                     views[event.camera].note(event, grey)
     except RecordingError:
         return None
-    return compared, ImuSamples.joined(imu)
+    return compared, ImuSamples.joined(imu), origin_ns
 
 
 def _of_images(name: str, seen: Views) -> list[Evidence]:

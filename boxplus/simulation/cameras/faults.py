@@ -284,7 +284,7 @@ def moving_object(start_s: float = 5.0, duration_s: float = 5.0, distance_m: flo
 
     words = ("moving object", "moves by itself", "outliers")
     text = f"an object fills half of the view for {duration_s:g} s"
-    return CameraFault("moving_object", text, words, "estimator", scenario=with_object)
+    return CameraFault("moving_object", text, words, "inspect", scenario=with_object)
 
 
 def on_imu(fault: imu_faults.Fault) -> Events:

@@ -21,6 +21,7 @@ from boxplus.runs.inspection.cameras.readout import check_readout
 from boxplus.runs.inspection.cameras.rotation import Turns, align, check_rotation, measured_turns
 from boxplus.runs.inspection.cameras.stereo import Corners, check_baseline, check_calibration
 from boxplus.runs.inspection.cameras.tracking import Turned, follow, rotation_between
+from boxplus.runs.inspection.cameras.two_motions import check_motions
 from boxplus.sensors.images.camera_image import CameraImage
 from boxplus.sensors.inertial.imu import ImuSamples
 
@@ -99,6 +100,10 @@ class Comparison:
             return []
         pair = self._pictures[:2]
         return [*check_baseline(pair), check_calibration(pair, self._corners, self._same)]
+
+    def of_view(self, origin_ns: int) -> list[Evidence]:
+        """Whether something large moves by itself before the first camera; times count from `origin_ns`."""
+        return check_motions(self._pictures[0], self._followed, origin_ns) if self._pictures else []
 
     def with_imu(self, imu: ImuSamples) -> list[Evidence]:
         """Whether camera and IMU turn alike and as far, and whether all rows of an image do; nothing without a camera."""

@@ -29,9 +29,12 @@ def examine_cameras(recording: CameraRecording, report: Callable[[float], None])
     to_8_bits = EightBits()
     compared = Comparison(pictures, pictures[0].count if pictures else 0)
     found: list[Evidence] = []
+    origin_ns: int | None = None
     try:
         for event in recording:
             report(recording.progress)
+            if origin_ns is None:
+                origin_ns = int(event.time_ns[0]) if isinstance(event, ImuSamples) else event.time_ns
             if isinstance(event, ImuSamples):
                 imu.append(event)
                 continue
@@ -50,6 +53,7 @@ def examine_cameras(recording: CameraRecording, report: Callable[[float], None])
             found += check_blur(camera.name, views[camera.index])
     if pictures:
         found += check_corners(pictures[0].name, compared.turns.followed, views[pictures[0].index])
+        found += compared.of_view(origin_ns or 0)
     if len(pictures) > 1:
         found.append(check_synchronisation(pictures[:2], [views[camera.index].time_ns for camera in pictures[:2]]))
         found += compared.of_cameras()
