@@ -29,6 +29,7 @@ _LIVELY_RAD_S = 0.05  # spread of the second axis that turns most
 _OUTLIERS = 3.0
 _OFFSET_S = 0.005
 _ANGLE_DEG = 1.5
+_CLOSER = 0.1  # by which the inverse of what is stated has to be closer than that itself, however little is known
 _UNLIKE, _FAR_OFF = 0.5, 3.0
 _HALF_TURN_DEG = 170.0
 _HALF_TURN_OFF_DEG = 5.0  # that a principal point beside the centre, turned with the image, puts one off
@@ -254,7 +255,7 @@ def check_rotation(camera: CameraStream, found: Alignment | str) -> list[Evidenc
     )
     if apart > max(_ANGLE_DEG, 4.0 * std):
         verdict = "error" if apart > 4.0 * max(_ANGLE_DEG, std) else "warning"
-        fits = inverted < _ANGLE_DEG < apart
+        fits = inverted < max(_ANGLE_DEG, min(4.0 * std, _CLOSER * apart))
         text += ": the inverse of what is stated fits" if fits else ": the stated mounting does not fit this recording"
         if apart > _HALF_TURN_DEG:
             for what, axes in _IMAGES.items():

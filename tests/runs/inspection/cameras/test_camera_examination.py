@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -17,7 +19,7 @@ from boxplus import Pinhole, diagnose
 from boxplus.cli import app
 from boxplus.recordings import CameraStream
 from boxplus.recordings.info import Evidence
-from boxplus.runs.inspection.cameras.rotation import Turns, align, check_rotation
+from boxplus.runs.inspection.cameras.rotation import Alignment, Turns, align, check_rotation
 from boxplus.sensors.inertial.imu import ImuSamples
 from tests.camera_recordings import FRAME_NS, START_NS, CameraBag, pgm, write_euroc
 
@@ -106,6 +108,29 @@ def test_findings_of_a_right_and_of_wrong_calibrations() -> None:
     assert all(evidence.verdict != "ok" for evidence in far.values())
     unknown = said(dataclasses.replace(stream(R), model=None))["R_imu_cam0"]
     assert unknown.verdict == "warning" and "intrinsics of cam0 are not known" in unknown.text
+
+
+@given(
+    angle=st.floats(0.6, 2.2),
+    std_deg=st.floats(0.05, 3.0),
+    sigmas=st.floats(0.0, 3.5),
+    seed=st.integers(0, 1000),
+    is_inverse=st.booleans(),
+)
+def test_a_mounting_is_inverted_where_its_inverse_is_as_close_as_is_known(
+    angle: float, std_deg: float, sigmas: float, seed: int, is_inverse: bool
+) -> None:
+    """And not where it is farther off than that, or hardly closer than what is stated."""
+    random = np.random.default_rng(seed)
+    axis, error = (v / np.linalg.norm(v) for v in random.normal(size=(2, 3)))
+    stated = Rotation.from_rotvec(angle * axis)
+    off_deg = min(sigmas * std_deg, 0.05 * np.degrees(angle)) if is_inverse else 4.5 * max(std_deg, 1.5)
+    near = stated.inv() * Rotation.from_rotvec(np.radians(off_deg) * error)
+    found = Alignment(near.as_matrix(), BIAS, 0.0, 1e-3, 0.1, np.radians(std_deg))
+    (_, said) = check_rotation(stream(stated.as_matrix()), found)
+    assert said.verdict == "error"
+    assert ("the inverse of what is stated fits" in said.text) == is_inverse
+    assert ("the stated mounting does not fit" in said.text) != is_inverse
 
 
 def test_rates_of_the_opposite_sign_about_two_axes_look_like_half_a_turn_of_the_mounting() -> None:
