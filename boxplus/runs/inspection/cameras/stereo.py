@@ -16,13 +16,14 @@ Floats = NDArray[np.float64]
 
 _FEWEST = 50
 _EPIPOLAR_PX = 1.5
-_FITS_SHARE, _FITS_PX = 0.5, 0.3
+_FITS_SHARE, _FITS_PX = 0.2, 0.3
 _IMAGES = {
     "turned upside down": (True, True),
     "mirrored left to right": (True, False),
     "mirrored top to bottom": (False, True),
 }
 """What may have been done to images of both cameras: whether u, and v, count from the other end."""
+_MOST_LOG_RATIO, _COARSE, _FINE = 0.7, 0.02, 0.002  # of focal lengths
 _PARALLAX_PX = 2.0
 _MOST_BEHIND = 0.5
 _FARTHEST_M = 10.0
@@ -116,6 +117,12 @@ def check_calibration(pair: list[CameraStream], corners: Corners, same: int = 0)
     for what, axes in _IMAGES.items():
         turned_1, turned_2 = (_mirrored(camera, seen, axes) for camera, seen in zip(pair, (first, second), strict=True))
         readings[f"with both images {what} it fits"] = pair[0], pair[1], turned_1, turned_2
+    if (ratio := _focal_ratio(pair[0], pair[1], first, second)) is not None:
+        cause = (
+            f"with a focal length of {pair[1].name} {ratio:.3f} times as long beside that of {pair[0].name} it fits, as where "
+            "images of one of them were scaled or cropped"
+        )
+        readings[cause] = pair[0], pair[1], first, _drawn(pair[1], second, ratio)
     best: tuple[float, str] | None = None
     for cause, reading in readings.items():
         fit = _fit(*reading)
@@ -133,6 +140,30 @@ def _mirrored(camera: CameraStream, pixels: Floats, axes: tuple[bool, bool]) -> 
     """Pixels (N, 2) with u, v or both counted from the other end."""
     last = np.array([camera.width, camera.height]) - 1.0
     return np.where(axes, last - pixels, pixels)
+
+
+def _drawn(camera: CameraStream, pixels: Floats, ratio: float) -> Floats:
+    """Pixels (N, 2) with the directions that they have by a focal length `ratio` times as long as what is stated."""
+    if camera.model is None:
+        return pixels
+    centre = np.array([camera.model.cx, camera.model.cy])
+    drawn: Floats = centre + (pixels - centre) / ratio
+    return drawn
+
+
+def _focal_ratio(one: CameraStream, two: CameraStream, first: Floats, second: Floats) -> float | None:
+    """How many times as long the second focal length should be; None where none between half and double fits best."""
+    ratio, ratios = 1.0, np.exp(np.arange(-_MOST_LOG_RATIO, _MOST_LOG_RATIO, _COARSE))
+    for _ in range(2):  # coarse, and around the best of these
+        fits = [_fit(one, two, first, _drawn(two, second, float(k))) for k in ratios]
+        # Directions that are drawn together have less noise: misfits are those of the pixels.
+        misfits = [np.inf if fit is None else float(k) * fit.median_px for fit, k in zip(fits, ratios, strict=True)]
+        best = int(np.argmin(misfits))
+        if not 0 < best < len(ratios) - 1:
+            return None
+        ratio = float(ratios[best])
+        ratios = ratio * np.exp(np.arange(-_COARSE, _COARSE + 0.5 * _FINE, _FINE))
+    return ratio if abs(float(np.log(ratio))) > _COARSE else None
 
 
 def _inverted(camera: CameraStream) -> CameraStream:

@@ -6,7 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from boxplus.manifolds import so3
 from boxplus.recordings.cameras.calibration import inverse
 from boxplus.recordings.cameras.info import CameraStream
 from boxplus.runs.inspection.cameras.stereo import Corners, check_baseline, check_calibration
@@ -43,6 +46,31 @@ def test_images_that_were_turned_mirrored_or_swapped_are_told_apart(
 ) -> None:
     said = check_calibration(PAIR, corners(seed, mirrored, swapped))
     assert said.verdict == ("error" if words else "ok") and words in said.text, said
+
+
+def scaled(camera: CameraStream, factor: float) -> CameraStream:
+    return replace(camera, model=replace(camera.model, fx=factor * camera.model.fx, fy=factor * camera.model.fy))
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    seed=st.integers(0, 1000), factor=st.floats(0.75, 1.35).filter(lambda factor: abs(factor - 1.0) > 0.06), second=st.booleans()
+)
+def test_the_focal_length_of_one_camera_is_told_with_its_ratio(seed: int, factor: float, second: bool) -> None:
+    pair = [PAIR[0], scaled(PAIR[1], factor)] if second else [scaled(PAIR[0], factor), PAIR[1]]
+    said = check_calibration(pair, corners(seed))
+    assert said.verdict == "error" and "focal length of cam1" in said.text and "scaled or cropped" in said.text
+    ratio = float(said.text.split(" times as long")[0].split()[-1])
+    assert abs(ratio * factor - 1.0 if second else ratio / factor - 1.0) < 0.01
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 1000), turn_deg=st.floats(0.7, 3.0), sign=st.sampled_from((-1.0, 1.0)), axis=st.sampled_from((0, 2)))
+def test_a_camera_that_has_turned_is_no_other_reading(seed: int, turn_deg: float, sign: float, axis: int) -> None:
+    T = PAIR[1].T_body_camera.copy()
+    T[:3, :3] = T[:3, :3] @ so3.exp(np.radians(sign * turn_deg) * np.eye(3)[axis])
+    said = check_calibration([PAIR[0], replace(PAIR[1], T_body_camera=T)], corners(seed))
+    assert said.verdict == "ok" or "swapping or inverting does not mend it" in said.text, said
 
 
 def test_one_camera_recorded_twice_is_said_whatever_its_corners() -> None:
