@@ -55,8 +55,8 @@ class PlaneMeasurement:
         weight: factor of the information, below 1 where the points are not where they seem.
         confirm: whether planes on which something hangs are held against more of the map: false ones are refused
             (`plane_confirmation`), curved ones bent (`curved_patches`).
-        bend_sparse: whether more of them are, where the map is sparser, if the sensor sees one way only. For those who
-            have a prediction: registrations that nothing else steadies do without.
+        bend_sparse: whether more of them are, where the map is sparser: for a sensor that sees one way (`sees_one_way`), and
+            those who have a prediction; registrations that nothing else steadies do without.
 
     Attributes:
         lever_arm: root mean square distance of the points from the LiDAR [m], 0.1 at least.
@@ -92,7 +92,7 @@ class PlaneMeasurement:
         self._directions: PoseDirections
         self.facing: NDArray[np.float64] = np.zeros(3)
         self.lever_arm = max(_spread_into(p_lidar, self.facing) if n else 1.0, 0.1)
-        self._bend_sparse = bend_sparse and math.hypot(*self.facing) > ONE_WAY
+        self._bend_sparse = bend_sparse
 
     def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
         """The information at the packed state x (36,); `rematch` searches the neighbours anew."""
@@ -239,6 +239,14 @@ class PlaneMeasurement:
         self._matched = True
         settle_normals(x, self._p_lidar, config.plane_threshold, self._planes, self._fate)
         self._matched_at = x.copy()
+
+
+def sees_one_way(points: NDArray[np.float32]) -> bool:
+    """Whether a scan (n, 3), LiDAR frame, is that of a sensor that sees one way: all within a cone of some 130 degrees."""
+    facing = np.zeros(3)
+    if len(points):
+        _spread_into(points, facing)
+    return math.hypot(*facing) > ONE_WAY
 
 
 @kernel

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,7 +14,7 @@ from boxplus.maps.curved_patches import FILLED_CELLS, PATCH, bend_planes
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
 from boxplus.maps.plane_matching import PLANE, WEIGHT
-from boxplus.maps.plane_measurement import PlaneMeasurement
+from boxplus.maps.plane_measurement import PlaneMeasurement, sees_one_way
 from boxplus.maps.registration_config import RegistrationConfig
 
 REACH_M, SIGMA_M, RANGE_M = 0.25, 0.02, 2.0
@@ -209,7 +208,15 @@ def test_a_sparse_map_of_bushes_pushes_a_sensor_that_looks_one_way_the_less(seed
     assert abs(patches) < 0.5 * chords
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_for_a_sensor_that_looks_around_a_sparse_map_changes_no_bit(seed: int) -> None:
-    plain, sparse = (_information(seed, 4, bend_sparse=wanted) for wanted in (False, True))
-    assert plain.A.tobytes() == sparse.A.tobytes() and plain.b.tobytes() == sparse.b.tobytes()
+@settings(max_examples=20)
+@given(seeds)
+def test_a_cone_of_130_degrees_is_one_way(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    half_turn = so3.exp(random.normal(size=3))
+    for cone_deg, one_way in ((40.0, True), (90.0, True), (120.0, True), (150.0, False), (360.0, False)):
+        cos = random.uniform(np.cos(np.radians(0.5 * cone_deg)), 1.0, 5000)  # evenly over the sphere
+        about = random.uniform(0.0, 2.0 * np.pi, 5000)
+        sin = np.sqrt(1.0 - cos**2)
+        rays = np.stack([cos, sin * np.cos(about), sin * np.sin(about)], axis=1) @ half_turn.T
+        assert sees_one_way((random.uniform(1.0, 50.0, (5000, 1)) * rays).astype(np.float32)) is one_way
+    assert not sees_one_way(np.zeros((0, 3), np.float32))

@@ -259,7 +259,9 @@ def _of_mounting(rotation: RotationFit, T_declared: NDArray[np.float64] | None) 
     else:
         advice = "check T_imu_lidar and that the topics are those of this mounting"
         if known == ROTATION_KNOWN_RAD:
-            advice += f"; found R_imu_lidar = {matrix_text(rotation.R_imu_lidar)}"
+            advice += f"; found R_imu_lidar = {matrix_text(rotation.closest_to(T_declared[:3, :3]))}"
+            if rotation.open_axis is not None:
+                advice += ", about the axis that the motion leaves open as it was given"
     return Finding("extrinsic", f"{text}; {advice}")
 
 

@@ -25,11 +25,12 @@ def mounting_in_use(agreement: Agreement, T_in_use: NDArray[np.float64]) -> Find
     if not seen.any() or angle < apart_allowed(rotation):
         return None
     known = rotation.rotation_std[1][:, seen]
-    x, y, z = known @ known.T @ so3.log(rotation.closest_to(T_in_use[:3, :3]) @ T_in_use[:3, :3].T) / angle
+    found = rotation.closest_to(T_in_use[:3, :3])
+    x, y, z = known @ known.T @ so3.log(found @ T_in_use[:3, :3].T) / angle
     return Finding(
         "extrinsic",
         f"gyroscope and LiDAR turn about axes {np.degrees(angle):.0f} deg apart under the mounting in use, which nobody gave: it "
-        f"began too far from the right one; give --T-imu-lidar (found: R_imu_lidar = {matrix_text(rotation.R_imu_lidar)})",
+        f"began too far from the right one; give --T-imu-lidar (found: R_imu_lidar = {matrix_text(found)})",
         (float(x), float(y), float(z)),
     )
 

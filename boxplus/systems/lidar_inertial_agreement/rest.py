@@ -92,7 +92,7 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
     open_axes = axes[:, ~seen].T
     if at_rest and seen.all() and not faces(path, scans, config, axes[:, 0]):
         open_axes = axes[:, :1].T
-    if at_rest and len(open_axes) == 1 and shifts_show(scans, open_axes[0], config):
+    if at_rest and len(open_axes) == 1 and len(last) == len(scans) and shifts_show(scans, open_axes[0], config):
         open_axes = open_axes[:0]
     return Rest(at_rest, open_axes, not_shown.T, speed, rate)
 

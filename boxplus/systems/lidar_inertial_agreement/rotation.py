@@ -33,6 +33,7 @@ _LEAST_SIGMA = 0.02  # rad/s: of a mean rate between two scans by registration a
 _FLOOR = np.array([2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 5e-3, 3e-3])  # what no number of scans averages away: registration lags
 _LED_ASTRAY = 0.02  # of what is explained, by which steps must not make it less
 _OPEN_RAD = 0.35  # standard deviation about an axis that the motion does not show
+_SAME_AXIS = 0.9  # cosine: the axis that a covariance leaves open also follows scale and clocks, and lies near that of the turns
 _IDENTITY = 1e-3  # pull towards the identity, of the LiDAR's power: decides what the motion leaves open
 
 
@@ -63,8 +64,7 @@ class RotationFit:
         intervals: pairs of scans compared.
         covered: share of the path that these pairs span, 0 to 1.
         coarse: whether the pairs are scans farther apart, as neighbours did not know their attitudes well enough.
-        main_axis: (3,) unit, IMU frame, about which the LiDAR's rate changed most: where it turned about that alone, the mounting
-            is open about it.
+        main_axis: (3,) unit, IMU frame, about which the LiDAR's rate changed most.
     """
 
     R_imu_lidar: NDArray[np.float64]
@@ -89,9 +89,15 @@ class RotationFit:
         Covariances are of small turns. About an open axis the estimate is any turn away from a mounting, and along axes that are
         not quite across it, some of that turn would pass for a disagreement.
         """
-        if np.count_nonzero(self.rotation_std[0] > _OPEN_RAD) != 1:
-            return self.R_imu_lidar
-        return turned_towards(self.R_imu_lidar, R_imu_lidar, self.main_axis)
+        return self.R_imu_lidar if self.open_axis is None else turned_towards(self.R_imu_lidar, R_imu_lidar, self.open_axis)
+
+    @property
+    def open_axis(self) -> NDArray[np.float64] | None:
+        """(3,) unit, IMU frame: the one about which the mounting stays open, as all else turned about it; None where none is."""
+        std, axes = self.rotation_std
+        if np.count_nonzero(std > _OPEN_RAD) != 1 or abs(float(axes[:, -1] @ self.main_axis)) < _SAME_AXIS:
+            return None
+        return self.main_axis
 
     @property
     def rotation_std(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -160,12 +166,12 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
     H: NDArray[np.float64] = best_fit.H / pairs.overlap
     count = float(weight.sum()) / pairs.overlap
     noise = (weight[:, None] * residual).T @ residual / pairs.overlap
-    variance = max(float(np.trace(noise)) / max(3.0 * count - 8.0, 1.0), _LEAST_SIGMA**2 / 9.0)
+    variance = max(float(np.trace(noise)) / max(3.0 * count - 8.0, 1.0), _LEAST_SIGMA**2 / 9.0, _variance_turning(best_fit))
     changes = 3.0 * count * _change_variance(imu, float(np.median(step_s))) / unit**2
     covariance = _covariance(_without_noise_of_changes(H / variance, changes / variance, count), noise / variance, count)
     covariance += np.diag(_FLOOR**2)
     centred = rate_lidar - rate_lidar.mean(axis=0)
-    power, axes = np.linalg.eigh(centred.T @ centred / len(centred))
+    power = np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred))[::-1], 0.0)
     total = float((centred**2).sum())
     # A flipped sign is looked for with clocks as they are: at some other offset anything fits a little.
     final, unshifted = exact(offset), exact(0.0)
@@ -185,15 +191,41 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
         mirrored,
         together,
         pairs.jitter,
-        np.sqrt(np.maximum(power[::-1], 0.0)),
+        np.sqrt(power),
         len(pairs.first),
         pairs.covered,
         pairs.overlap > 1.0,
-        R @ axes[:, -1],
+        _main_axis(best_fit),
     )
     closest = fit.closest_to(expected)
     mean = weight @ rate_lidar / weight.sum()
     return replace(fit, R_imu_lidar=closest, bias=unit * (bias + scale * (R - closest) @ mean))
+
+
+def _typical(off: NDArray[np.float64], rate: NDArray[np.float64]) -> float:
+    """The median of what intervals are off by (K,), each as often as it counts: by its squared rate (K, 3), the gyroscope's.
+
+    Where a platform rests and then moves, most intervals are off by the noise of rest only, and show nothing. Against that, those
+    that show the mounting would all be outliers, but for the few that happen to fit.
+    """
+    order = np.argsort(off)
+    counts = np.cumsum(((rate - rate.mean(axis=0)) ** 2).sum(axis=1)[order] + 1e-12)
+    return float(off[order[np.searchsorted(counts, 0.5 * counts[-1])]])
+
+
+def _main_axis(fit: _Refined) -> NDArray[np.float64]:
+    """(3,) about which most turned, IMU frame, by the intervals that the fit counts: one bad registration turns any axis."""
+    rate = fit.seen - fit.weight @ fit.seen / fit.weight.sum()
+    axis: NDArray[np.float64] = np.linalg.eigh((fit.weight[:, None] * rate).T @ rate)[1][:, -1]
+    return axis
+
+
+def _variance_turning(fit: _Refined) -> float:
+    """Variance of the rates [(rad/s)²] of the intervals that show the mounting: each counts by its squared rate."""
+    rate = fit.seen - fit.seen.mean(axis=0)
+    counts = fit.weight * (rate**2).sum(axis=1) + 1e-12
+    many = float(counts.sum() ** 2 / (counts**2).sum())
+    return float(counts @ (fit.residual**2).sum(axis=1) / counts.sum()) * many / max(3.0 * many - 8.0, 1.0)
 
 
 def _covariance(H: NDArray[np.float64], noise: NDArray[np.float64], count: float) -> NDArray[np.float64]:
@@ -292,10 +324,10 @@ class _Refined:
         """The normal equations (8, 8), (8,) of a step from where the estimate is; residuals, weights and information there."""
         rate_imu = self._exact(self.offset_s)
         slope = (self._exact(self.offset_s + _SLOPE_S) - self._exact(self.offset_s - _SLOPE_S)) / (2.0 * _SLOPE_S)
-        seen = self.scale * self._rate_lidar @ self.R.T
+        self.seen = seen = self.scale * self._rate_lidar @ self.R.T
         self.residual = rate_imu - seen - self.bias
         norm = np.linalg.norm(self.residual, axis=1)
-        sigma = max(1.4826 * float(np.median(norm)) / 1.54, 1e-3)  # the median of a 3-d normal's length is 1.54 sigma
+        sigma = max(1.4826 * _typical(norm, rate_imu) / 1.54, 1e-3)  # the median of a 3-d normal's length is 1.54 sigma
         self.weight: NDArray[np.float64] = 1.0 / (1.0 + (norm / (4.0 * sigma)) ** 2) ** 2
         # Derivatives of the residual: R <- Exp(θ) R, bias, log scale, offset.
         J = np.zeros((len(self._rate_lidar), 3, 8))
@@ -340,7 +372,7 @@ class _Kabsch:
             norm = np.linalg.norm(self.residual, axis=1)
             # Of a platform that mostly turns steadily the median is far below what registration knows of its few fast turns:
             # these would be thrown out as outliers, and with them all that shows the mounting about the other axes.
-            sigma = max(float(np.median(norm)), self.scale * _LEAST_SIGMA / 3.0)
+            sigma = max(_typical(norm, rate_imu), self.scale * _LEAST_SIGMA / 3.0)
             weight = 1.0 / (1.0 + (norm / (3.0 * sigma)) ** 2) ** 2
         left, turned = float((self.residual**2).sum()), float((b * b).sum())
         self.explained: float = 1.0 - min(left / max(self.scale**2 * turned, 1e-12), 1.0)

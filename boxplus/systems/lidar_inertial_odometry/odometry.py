@@ -17,7 +17,7 @@ from boxplus.filtering.propagation import NODE, propagate_interval
 from boxplus.filtering.uncertain_instant import UncertainInstant
 from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
-from boxplus.maps.plane_measurement import PlaneMeasurement
+from boxplus.maps.plane_measurement import PlaneMeasurement, sees_one_way
 from boxplus.maps.sliding_box import SlidingBox
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.inertial.imu_saturation import Saturation
@@ -90,6 +90,7 @@ class LidarInertialOdometry(Snapshots):
         self._warnings: list[str] = []
         self._x_before: NDArray[np.float64] = np.zeros(0)
         self._motion: NDArray[np.float64] = np.zeros((2, 3))  # turn rate and velocity over the last scan
+        self._one_way = False  # whether the LiDAR sees one way
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
         self._datum = MapDatum(NavState.identity().pack(), self._cov, SHARED_ERRORS)
@@ -204,7 +205,9 @@ class LidarInertialOdometry(Snapshots):
         if found.kind == "static":
             self._standstill = Standstill(joined_imu([first, *rest]), found.state.p_world_imu)
         p_lidar = deskew_first(first, found.state, self.config)
-        self._insert(found.state.to_world(self._thinned(p_lidar)[1]))
+        points, map_points = self._thinned(p_lidar)
+        self._one_way = sees_one_way(points)  # for good: what flies high sees the ground only, and may do so in rings
+        self._insert(found.state.to_world(map_points))
         self._warnings = [text for text in (self._gap, found.warning) if text]
         return [self._estimate(first, p_lidar), *self._advance(rest)]
 
@@ -338,9 +341,8 @@ class LidarInertialOdometry(Snapshots):
     def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:
         with_extrinsic = self.config.extrinsic_estimation != "off"
         weight = _BLIND_WEIGHT if self._is_blind(frame) else 1.0
-        return PlaneMeasurement(
-            points, self.map, self.config, with_extrinsic=with_extrinsic, weight=weight, confirm=True, bend_sparse=True
-        )
+        how = {"with_extrinsic": with_extrinsic, "confirm": True, "bend_sparse": self._one_way}
+        return PlaneMeasurement(points, self.map, self.config, weight=weight, **how)
 
     def _is_blind(self, frame: Frame) -> bool:
         return frame.largest_gap_s > self.config.max_imu_gap

@@ -54,5 +54,10 @@ def test_a_turn_is_the_one_from_the_given_mounting() -> None:
     turn, known = turn_from(rotation, other)
     assert np.degrees(np.linalg.norm(turn - so3.log(T[:3, :3] @ other.T))) < 1.0
     np.testing.assert_allclose(np.linalg.inv(known), rotation.covariance[:3, :3])
+    open_axis = np.array([0.0, 0.0, 1.0])
+    covariance = rotation.covariance.copy()
+    covariance[:3, :3] = np.diag([1e-4, 1e-4, 1.0])
+    about = replace(rotation, R_imu_lidar=so3.exp(2.0 * open_axis) @ T[:3, :3], covariance=covariance, main_axis=open_axis)
+    np.testing.assert_allclose(turn_from(about, T[:3, :3])[0], 0.0, atol=1e-9)
     right = turn_from(replace(rotation, R_imu_lidar=T[:3, :3]), T[:3, :3])
     assert mounting_of_many([right] * 3) is None

@@ -9,6 +9,7 @@ from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation
 from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.motions.spline import Trajectory
 from boxplus.simulation.worlds import worlds
+from boxplus.systems.lidar_inertial_agreement import rest as rest_module
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns
 from boxplus.systems.lidar_inertial_agreement.rest import Rest, judge_rest
@@ -70,3 +71,28 @@ def test_one_wall_does_not_show_a_turn_about_its_normal(reach_m: float, noise: f
         assert np.allclose(rest.open_turns, not_shown.T) and not rest.determined
         rates.append(rest.turn_rate)
     assert np.sqrt(np.mean(np.square(rates))) < noise
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_shifts_along_the_one_open_axis_decide(shown: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no surface is told to face it: along the axis that is known least, and nothing is open where they show it."""
+    asked = []
+
+    def shifts_show(scans: object, axis: np.ndarray, config: object) -> bool:
+        asked.append(axis)
+        return shown
+
+    monkeypatch.setattr(rest_module, "faces", lambda *_: False)
+    monkeypatch.setattr(rest_module, "shifts_show", shifts_show)
+    rest = rest_of(trajectories.at_rest(2.0, START))
+    assert rest.at_rest and len(asked) == 1
+    assert rest.determined is shown
+    if not shown:
+        np.testing.assert_array_equal(rest.open_axes, asked)
+
+
+def test_shifts_of_the_scans_themselves_show_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rest_module, "faces", lambda *_: False)
+    assert rest_of(trajectories.at_rest(2.0, START)).determined
+    monkeypatch.setattr(rest_module, "shifts_show", lambda *_: False)
+    assert not rest_of(trajectories.at_rest(2.0, START)).determined

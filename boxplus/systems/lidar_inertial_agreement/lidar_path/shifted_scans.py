@@ -14,29 +14,35 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.sensors.lidar.scan import Scan
 
-_COMPARED, _POINTS, _FEWEST = 3, 3000, 100  # scans at either end, points of one, and fewer of them say nothing
+_COMPARED, _POINTS, _FEWEST = 3, 3000, 100  # scans at either end at most, points of one, and fewer of them say nothing
+_APART_S = 0.55  # between the first ones and the last: less leaves slower motions unseen
 _NEAR_M = 3.0  # what goes along with a LiDAR, a mast or who carries it, is nearer: it fits at rest whatever moves
-_SHIFTS_M = (0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8)  # within the first second: less is no motion of a vehicle
+_SHIFTS_M = (0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8)  # less is for the registrations to see: a third of a metre a second
 _WORSE = 1.4  # times the cost; rings that lie askew on a smooth tunnel reach 1.3 at the least of these shifts
 
 
 def shifts_show(scans: Sequence[Scan], axis: NDArray[np.float64], config: RegistrationConfig) -> bool:
-    """Whether the last scans fit the first ones unmoved, and clearly worse at any shift along an axis.
+    """Whether the last scans fit the first ones clearly worse at any shift of 0.2 m and more along an axis than unmoved.
 
     Where surfaces that face it are hard to tell, as among stems and leaves, a shift still leaves everything beside its place.
-    Along a tunnel or a street between smooth walls the scans fit as well.
+    Along a tunnel or a street between smooth walls the scans fit as well. Motions of less than a third of a metre a second stay
+    unseen, and what is repeated is told from the same by nothing here: registrations have to say that the scans lie still.
 
     Args:
-        scans: some that may all have been taken from one place.
+        scans: some that may all have been taken from one place; False where the last follow the first within half a second.
         axis: (3,) unit vector in the LiDAR's frame.
         config: of the LiDAR's noise and the sizes of cells.
     """
+    count = min(_COMPARED, len(scans) // 2)
+    first, last = scans[:count], scans[len(scans) - count :]
+    if not count or (last[0].start_ns + last[-1].end_ns - first[0].start_ns - first[-1].end_ns) * 0.5e-9 < _APART_S:
+        return False
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     voxel_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), _POINTS)
-    for scan in scans[:_COMPARED]:
+    for scan in first:
         tree.insert(voxel_filter(scan.p_lidar)[1].astype(np.float64), downsample=True)
     measurements = []
-    for scan in scans[-_COMPARED:]:
+    for scan in last:
         points = voxel_filter(scan.p_lidar)[0]
         points = points[np.linalg.norm(points, axis=1) > _NEAR_M]
         if len(points) < _FEWEST:

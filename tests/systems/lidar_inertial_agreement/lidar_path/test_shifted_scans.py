@@ -56,6 +56,50 @@ def test_what_goes_along_with_the_lidar_shows_nothing(monkeypatch: pytest.Monkey
     assert shifts_show(scans, np.eye(3)[0], CONFIG)
 
 
+def test_scans_are_not_compared_with_themselves_or_their_neighbours() -> None:
+    """Half a second between the first and the last: else a slow walk lies upon itself."""
+    room = worlds.room((30.0, 18.0, 6.0), seed=4)
+    scans = scans_of(room, SPINNING, 0.0)
+    axis = np.eye(3)[0]
+    for few in (scans[:0], scans[:1], scans[:3], scans[:5], scans[:6]):
+        assert not shifts_show(few, axis, CONFIG)
+    assert shifts_show([scans[0], scans[9]], axis, CONFIG)
+    assert not shifts_show([scans[0], scans[5]], axis, CONFIG)
+
+
+@pytest.mark.parametrize(("costs", "shown"), [(1.45, True), (1.35, False)])
+def test_every_shift_has_to_cost_more_than_rings_that_lie_askew(
+    costs: float, shown: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Either way and at each distance: 1.3 was reached in motion."""
+    asked = []
+
+    def cost(_: object, shift: np.ndarray, __: object) -> float:
+        asked.append(shift)
+        return costs if shift.any() else 1.0
+
+    monkeypatch.setattr(shifted_scans, "_cost", cost)
+    scans = scans_of(worlds.room((30.0, 18.0, 6.0), seed=4), SPINNING, 0.0)
+    axis = np.array([0.6, 0.0, -0.8])
+    assert shifts_show(scans, axis, CONFIG) is shown
+    if shown:
+        along = np.sort([float(shift @ axis) for shift in asked])
+        np.testing.assert_allclose(along, [-12.8, -6.4, -3.2, -1.6, -0.8, -0.4, -0.2, 0.0, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8])
+        np.testing.assert_allclose(np.cross(asked, axis), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("worse", range(14))
+def test_one_shift_that_fits_leaves_the_axis_open(worse: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = [0]
+
+    def cost(_: object, shift: np.ndarray, __: object) -> float:
+        asked[0] += 1
+        return 1.0 if not shift.any() or asked[0] == worse + 2 else 9.0
+
+    monkeypatch.setattr(shifted_scans, "_cost", cost)
+    assert not shifts_show(scans_of(worlds.room((30.0, 18.0, 6.0), seed=4), SPINNING, 0.0), np.eye(3)[0], CONFIG)
+
+
 def test_few_points_beyond_what_is_near_say_nothing() -> None:
     near = worlds.room((4.0, 4.0, 2.6), seed=1)
     motion = manoeuvres.constant_velocity(2.0, (0.0, 0.0, 1.3), (0.0, 0.0, 0.0), np.eye(3))
