@@ -25,7 +25,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Tur
 from boxplus.systems.lidar_inertial_agreement.rotation import RotationFit, compare_rotations
 
 _CLEARLY = 0.9  # of the misfit, with points left as they are: of corrected ones 0.62 to 0.83, of others 1.16 and more
-_DOUBTFUL_S, _DEVIATIONS = 0.008, 3.0  # offset of the clocks that is worth a second look
+_DOUBTFUL_S, _DEVIATIONS = 0.008, 2.0  # offset of the clocks that is worth a second look, which decides
 _EXPLAINED = 0.8
 _INSTANTS = {-0.5: "its beginning", 0.0: "its middle", 0.5: "its end"}  # in lengths of the scan after its middle
 _AT_AN_END = 0.25  # of a scan, within which an instant is its beginning, middle or end
