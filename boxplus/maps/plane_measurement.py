@@ -242,7 +242,7 @@ class PlaneMeasurement:
 
 
 def sees_one_way(points: NDArray[np.float32]) -> bool:
-    """Whether a scan (n, 3), LiDAR frame, is that of a sensor that sees one way: all within a cone of some 130 degrees."""
+    """Whether a scan (n, 3), LiDAR frame, finite, is of a sensor that sees one way: all within a cone of some 130 degrees."""
     facing = np.zeros(3)
     if len(points):
         _spread_into(points, facing)

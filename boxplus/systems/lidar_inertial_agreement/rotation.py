@@ -34,6 +34,7 @@ _FLOOR = np.array([2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 5e-3, 3e-3])  # what no numb
 _LED_ASTRAY = 0.02  # of what is explained, by which steps must not make it less
 _OPEN_RAD = 0.35  # standard deviation about an axis that the motion does not show
 _SAME_AXIS = 0.9  # cosine: the axis that a covariance leaves open also follows scale and clocks, and lies near that of the turns
+_FASTEST = 0.75  # of the intervals count by their rates, those above as much as these
 _IDENTITY = 1e-3  # pull towards the identity, of the LiDAR's power: decides what the motion leaves open
 
 
@@ -202,15 +203,32 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
     return replace(fit, R_imu_lidar=closest, bias=unit * (bias + scale * (R - closest) @ mean))
 
 
+def _counts(rate: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K,) how much intervals show of a mounting: their squared rates (K, 3), but none more than a quarter of them all.
+
+    A few fast ones, at a bump that registrations follow roughly, would else be all that counts.
+    """
+    squared = ((rate - rate.mean(axis=0)) ** 2).sum(axis=1)
+    counts: NDArray[np.float64] = np.minimum(squared, np.quantile(squared, _FASTEST)) + 1e-12
+    return counts
+
+
 def _typical(off: NDArray[np.float64], rate: NDArray[np.float64]) -> float:
-    """The median of what intervals are off by (K,), each as often as it counts: by its squared rate (K, 3), the gyroscope's.
+    """The median of what intervals are off by (K,), each as often as it counts by its rate (K, 3), the gyroscope's.
 
     Where a platform rests and then moves, most intervals are off by the noise of rest only, and show nothing. Against that, those
     that show the mounting would all be outliers, but for the few that happen to fit.
     """
     order = np.argsort(off)
-    counts = np.cumsum(((rate - rate.mean(axis=0)) ** 2).sum(axis=1)[order] + 1e-12)
+    counts = np.cumsum(_counts(rate)[order])
     return float(off[order[np.searchsorted(counts, 0.5 * counts[-1])]])
+
+
+def _variance_turning(fit: _Refined) -> float:
+    """Variance of the rates [(rad/s)²] of the intervals that show the mounting, each as it counts."""
+    counts = fit.weight * _counts(fit.seen)
+    many = float(counts.sum() ** 2 / (counts**2).sum())
+    return float(counts @ (fit.residual**2).sum(axis=1) / counts.sum()) * many / max(3.0 * many - 8.0, 1.0)
 
 
 def _main_axis(fit: _Refined) -> NDArray[np.float64]:
@@ -218,14 +236,6 @@ def _main_axis(fit: _Refined) -> NDArray[np.float64]:
     rate = fit.seen - fit.weight @ fit.seen / fit.weight.sum()
     axis: NDArray[np.float64] = np.linalg.eigh((fit.weight[:, None] * rate).T @ rate)[1][:, -1]
     return axis
-
-
-def _variance_turning(fit: _Refined) -> float:
-    """Variance of the rates [(rad/s)²] of the intervals that show the mounting: each counts by its squared rate."""
-    rate = fit.seen - fit.seen.mean(axis=0)
-    counts = fit.weight * (rate**2).sum(axis=1) + 1e-12
-    many = float(counts.sum() ** 2 / (counts**2).sum())
-    return float(counts @ (fit.residual**2).sum(axis=1) / counts.sum()) * many / max(3.0 * many - 8.0, 1.0)
 
 
 def _covariance(H: NDArray[np.float64], noise: NDArray[np.float64], count: float) -> NDArray[np.float64]:
@@ -372,7 +382,7 @@ class _Kabsch:
             norm = np.linalg.norm(self.residual, axis=1)
             # Of a platform that mostly turns steadily the median is far below what registration knows of its few fast turns:
             # these would be thrown out as outliers, and with them all that shows the mounting about the other axes.
-            sigma = max(_typical(norm, rate_imu), self.scale * _LEAST_SIGMA / 3.0)
+            sigma = max(float(np.median(norm)), self.scale * _LEAST_SIGMA / 3.0)
             weight = 1.0 / (1.0 + (norm / (3.0 * sigma)) ** 2) ** 2
         left, turned = float((self.residual**2).sum()), float((b * b).sum())
         self.explained: float = 1.0 - min(left / max(self.scale**2 * turned, 1e-12), 1.0)

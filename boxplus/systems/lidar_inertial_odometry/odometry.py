@@ -205,9 +205,9 @@ class LidarInertialOdometry(Snapshots):
         if found.kind == "static":
             self._standstill = Standstill(joined_imu([first, *rest]), found.state.p_world_imu)
         p_lidar = deskew_first(first, found.state, self.config)
-        points, map_points = self._thinned(p_lidar)
-        self._one_way = sees_one_way(points)  # for good: what flies high sees the ground only, and may do so in rings
-        self._insert(found.state.to_world(map_points))
+        if self._gap is None:  # for good: what flies high sees the ground only, and may do so in rings
+            self._one_way = all(sees_one_way(frame.scan.p_lidar) for frame in (first, *rest))
+        self._insert(found.state.to_world(self._thinned(p_lidar)[1]))
         self._warnings = [text for text in (self._gap, found.warning) if text]
         return [self._estimate(first, p_lidar), *self._advance(rest)]
 
@@ -341,8 +341,10 @@ class LidarInertialOdometry(Snapshots):
     def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:
         with_extrinsic = self.config.extrinsic_estimation != "off"
         weight = _BLIND_WEIGHT if self._is_blind(frame) else 1.0
-        how = {"with_extrinsic": with_extrinsic, "confirm": True, "bend_sparse": self._one_way}
-        return PlaneMeasurement(points, self.map, self.config, weight=weight, **how)
+        sparse = self._one_way
+        return PlaneMeasurement(
+            points, self.map, self.config, with_extrinsic=with_extrinsic, weight=weight, confirm=True, bend_sparse=sparse
+        )
 
     def _is_blind(self, frame: Frame) -> bool:
         return frame.largest_gap_s > self.config.max_imu_gap

@@ -150,6 +150,26 @@ def test_what_is_off_only_in_motion_is_known_no_better_than_in_motion(mended: bo
         assert np.mean(contradicted) > 0.3
 
 
+@pytest.mark.parametrize(("count", "fast_deg_s", "shown"), [(1, 50.0, 0.0), (3, 100.0, 0.5), (8, 100.0, 0.5)])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_few_fast_turns_that_registrations_show_roughly_hide_nothing(
+    seed: int, count: int, fast_deg_s: float, shown: float
+) -> None:
+    """A bump, or a gyroscope's glitch: counted by their squares, these would be all that counts, and nothing else be known."""
+    random = np.random.default_rng(seed)
+    K, R_imu_lidar = 78, so3.exp(random.normal(size=3))
+    rate = np.deg2rad(10.0 * np.sin(np.arange(K)[:, None] * random.uniform(0.2, 0.6, 3) + random.uniform(0.0, 6.0, 3)))
+    registered, fast = rate.copy(), random.choice(K, count, replace=False)
+    turns = np.deg2rad(fast_deg_s) * so3.exp(random.normal(size=(count, 3)))[:, 0]
+    rate[fast] += turns
+    registered[fast] += shown * turns + 0.2 * np.deg2rad(fast_deg_s) * random.normal(size=(count, 3))
+    axis = random.normal(size=3)
+    wrong = so3.exp(np.radians(20.0) * axis / np.linalg.norm(axis)) @ R_imu_lidar
+    for given, contradicted in ((R_imu_lidar, False), (wrong, True)):
+        fit = compared(rate, np.deg2rad(np.full((K, 3), 0.3)), R_imu_lidar, random, given, registered)
+        assert (contradicted_within(fit, given) is not None) is contradicted
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_turned_towards_another_rotation_as_close_as_an_axis_allows(seed: int) -> None:
     random = np.random.default_rng(seed)

@@ -119,8 +119,8 @@ def check_calibration(pair: list[CameraStream], corners: Corners, same: int = 0)
         readings[f"with both images {what} it fits"] = pair[0], pair[1], turned_1, turned_2
     if (ratio := _focal_ratio(pair[0], pair[1], first, second)) is not None:
         cause = (
-            f"with a focal length of {pair[1].name} {ratio:.3f} times as long beside that of {pair[0].name} it fits, as where "
-            "images of one of them were scaled or cropped"
+            f"with a focal length of {pair[1].name} {ratio:.3f} times as long beside that of {pair[0].name} it fits: one of "
+            "them is wrong, calibrate both"
         )
         readings[cause] = pair[0], pair[1], first, _drawn(pair[1], second, ratio)
     best: tuple[float, str] | None = None

@@ -3,8 +3,10 @@
 What stands still in the world moves in the images by one essential matrix E (yᵀ E x = 0 for directions x, y of a corner in two
 images). What moves by itself has another one, and is a part of the view with an edge. Both matrices are estimated in turn with
 the part that belongs to each, beginning with what lies far from the epipolar lines of the first: a corner goes with the matrix
-that it and its neighbours fit better, so that a few corners that were followed wrongly make no part. Calibrations that are wrong
-and rolling shutters bend the view smoothly, and one matrix leaves little that another one explains.
+that it and its neighbours fit better, so that a few corners that were followed wrongly make no part. Rolling shutters bend the
+view smoothly, and one matrix leaves little that another one explains. So do calibrations that are wrong, but not where depth goes
+with the place in the image, a near wall beside what is far: what is said names them as well. A camera that stands still is not
+looked at, nor what passes after its first moving images.
 
 Source: the alternation is that of Lloyd, IEEE Transactions on Information Theory 1982, with motions in the place of means.
 """
@@ -30,10 +32,11 @@ Mask = NDArray[np.bool_]
 _FEWEST, _FEWEST_OF_PART = 50, 15  # corners of a pair of images, and of a part
 _NEAR_PX, _FAR_PX = 1.0, 3.0  # from an epipolar line: of a corner that fits, and of one that does not
 _NEIGHBOURS, _ROUNDS = 8, 4
+_SURE, _MOST_TRIES = 0.99, 300
 _OWN = 0.75  # share of a part that fits its own motion
 _LEAST_SHARE = 0.15  # of the corners
 _STILL_PX = 0.5  # a part that stands still in the image is carried along, and does not move by itself
-_FEWEST_PAIRS = 5
+_FEWEST_PAIRS, _LONGEST_GAP, _MOST_OF = 5, 5, 0.5  # of a stretch: pairs with two parts, steps between them, and their share
 _SAME_PLACE = 0.5  # agreement of the parts from pair to pair: 1 the same, 0 chance
 _ROWS, _COLUMNS = 8, 12  # at which parts are compared
 
@@ -60,7 +63,8 @@ def check_motions(camera: CameraStream, pairs: Sequence[Followed], origin_ns: in
     """
     if camera.model is None:
         return []
-    found = [(pair, parts) for pair in pairs if (parts := _parts(camera.model, pair)) is not None]
+    model = camera.model
+    found = _longest([(pair, _parts(model, pair)) for pair in pairs])
     if len(found) < _FEWEST_PAIRS:
         return []
     maps = np.array([_spread(parts, camera) for _, parts in found])
@@ -73,9 +77,23 @@ def check_motions(camera: CameraStream, pairs: Sequence[Followed], origin_ns: in
     begin_s, end_s = ((time_ns - origin_ns) * 1e-9 for time_ns in (found[0][0].begin_ns, found[-1][0].end_ns))
     text = (
         f"between {begin_s:.1f} and {end_s:.1f} s something that moves by itself fills {share:.0%} of the view (or all but "
-        f"that): in {len(found)} pairs of images the corners of two parts each agree on a motion, and not on the same one"
+        f"that): in {len(found)} pairs of images the corners of two parts each agree on a motion, and not on the same one. Leave "
+        "these seconds out or give an IMU; where nothing passed by, the calibration of the camera is wrong"
     )
     return [Evidence(f"{camera.name}_motions", "two", "warning", text)]
+
+
+def _longest(pairs: Sequence[tuple[Followed, _Parts | None]]) -> list[tuple[Followed, _Parts]]:
+    """Of the stretches of pairs most of which have two parts, at most a few in a row having one, that with the most."""
+    stretches: list[list[int]] = []
+    for k in (k for k, (_, parts) in enumerate(pairs) if parts is not None):
+        if stretches and k - stretches[-1][-1] <= _LONGEST_GAP:
+            stretches[-1].append(k)
+        else:
+            stretches.append([k])
+    most = [stretch for stretch in stretches if len(stretch) > _MOST_OF * (stretch[-1] - stretch[0] + 1)]
+    longest = max(most, key=len, default=[])
+    return [(pair, parts) for pair, parts in (pairs[k] for k in longest) if parts is not None]
 
 
 def _parts(model: CameraModel, pair: Followed) -> _Parts | None:
@@ -116,7 +134,9 @@ def _off_px(x: Floats, y: Floats, part: Mask, fx: float) -> Floats | None:
         return None
     cv2 = require("cv2", "which finds the essential matrix")
     first, second = np.ascontiguousarray(x[part]), np.ascontiguousarray(y[part])
-    E, _ = cv2.findEssentialMat(first, second, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=_NEAR_PX / fx)
+    E, _ = cv2.findEssentialMat(
+        first, second, np.eye(3), method=cv2.RANSAC, prob=_SURE, threshold=_NEAR_PX / fx, maxIters=_MOST_TRIES
+    )
     if E is None or E.shape != (3, 3):
         return None
     ones = np.ones((len(x), 1))

@@ -29,7 +29,8 @@ def shifts_show(scans: Sequence[Scan], axis: NDArray[np.float64], config: Regist
     unseen, and what is repeated is told from the same by nothing here: registrations have to say that the scans lie still.
 
     Args:
-        scans: some that may all have been taken from one place; False where the last follow the first within half a second.
+        scans: some that may all have been taken from one place; False where the middles of the last and the first are not 0.55 s
+            apart.
         axis: (3,) unit vector in the LiDAR's frame.
         config: of the LiDAR's noise and the sizes of cells.
     """

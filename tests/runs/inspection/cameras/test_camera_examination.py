@@ -133,6 +133,20 @@ def test_a_mounting_is_inverted_where_its_inverse_is_as_close_as_is_known(
     assert ("the stated mounting does not fit" in said.text) != is_inverse
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_an_inverse_that_is_hardly_closer_than_what_is_stated_is_not_named(seed: int) -> None:
+    """Of little rotation much fits within four deviations."""
+    random = np.random.default_rng(seed)
+    axis = random.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    across = np.cross(axis, random.normal(size=3))
+    stated = Rotation.from_rotvec(np.radians(25.0) * axis)
+    near = stated.inv() * Rotation.from_rotvec(np.radians(15.0) * across / np.linalg.norm(across))
+    found = Alignment(near.as_matrix(), BIAS, 0.0, 1e-3, 0.1, np.radians(5.0))
+    (_, said) = check_rotation(stream(stated.as_matrix()), found)
+    assert said.verdict != "ok" and "the stated mounting does not fit" in said.text
+
+
 def test_rates_of_the_opposite_sign_about_two_axes_look_like_half_a_turn_of_the_mounting() -> None:
     """And both are said."""
     turns, imu = turning(1, 0.0, np.eye(3))

@@ -110,6 +110,19 @@ def test_inspect_tells_when_something_passes_before_the_camera() -> None:
     assert not any(finding.key == "cam0_motions" for finding in examine_cameras(as_camera_recording(simulation), lambda _: None))
 
 
+def test_pairs_that_tell_follow_one_another() -> None:
+    """Five of a minute are accidents, and the time between them is not that of anything."""
+    told, quiet = pairs(0.4, 0, count=12), pairs(0.0, 1, count=60)
+    spread = [told[k // 10] if k % 10 == 0 else pair for k, pair in enumerate(quiet)]
+    assert check_motions(CAMERA, spread, ORIGIN_NS) == []
+    assert len(check_motions(CAMERA, [*quiet[:10], *told, *quiet[10:]], ORIGIN_NS)) == 1
+
+
+def test_a_calibration_that_is_wrong_is_named_beside_what_moves() -> None:
+    (said,) = check_motions(CAMERA, pairs(0.4, 3), ORIGIN_NS)
+    assert "where nothing passed by, the calibration of the camera is wrong" in said.text
+
+
 def test_a_few_pairs_or_corners_and_a_camera_that_is_not_known_say_nothing() -> None:
     assert check_motions(CAMERA, pairs(0.4, 0, count=4), ORIGIN_NS) == []
     assert check_motions(replace(CAMERA, model=None), pairs(0.4, 0), ORIGIN_NS) == []
