@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,22 +13,15 @@ import pytest
 
 from boxplus.recordings.info import Evidence
 from boxplus.simulation.cameras import CAMERA_FAULTS
-
-FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+from tests.campaign_modules import campaign_modules
 
 
 @pytest.fixture(scope="module")
 def campaign() -> Iterator[SimpleNamespace]:
     """The script and its draws, which are no package of the library; they leave no trace."""
-    sys.path.insert(0, str(FOLDER))
-    try:
-        draws = importlib.import_module("vio_campaign.draws")
-        script, judge = (importlib.import_module(name) for name in ("camera_campaign", "vio_campaign.judge"))
-        yield SimpleNamespace(draws=draws, script=script, judge=judge, direct=importlib.import_module("vio_campaign.direct"))
-    finally:
-        sys.path.remove(str(FOLDER))
-        for name in [name for name in sys.modules if name.partition(".")[0] in ("vio_campaign", "camera_campaign")]:
-            del sys.modules[name]
+    of = {name: f"vio_campaign.{name}" for name in ("draws", "judge", "direct")}
+    with campaign_modules(**of, script="camera_campaign") as modules:
+        yield modules
 
 
 def test_every_kind_is_drawn_and_fits(campaign: SimpleNamespace) -> None:

@@ -21,21 +21,16 @@ from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Simulation, faults, write_recording
 from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
+from tests.campaign_modules import campaign_modules
 
-FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 PARTS = ("draws", "judge", "nuisances", "places", "real", "report", "run", "spoil", "traffic")
 
 
 @pytest.fixture(scope="module")
 def campaign() -> Iterator[SimpleNamespace]:
     """The modules of the campaign, which is not a package of the library; they leave no trace."""
-    sys.path.insert(0, str(FOLDER))
-    try:
-        yield SimpleNamespace(**{name: importlib.import_module(f"lio_campaign.{name}") for name in PARTS})
-    finally:
-        sys.path.remove(str(FOLDER))
-        for name in [name for name in sys.modules if name.partition(".")[0] == "lio_campaign"]:
-            del sys.modules[name]
+    with campaign_modules(**{name: f"lio_campaign.{name}" for name in PARTS}) as modules:
+        yield modules
 
 
 @pytest.fixture(scope="module")

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+from tests.campaign_modules import campaign_modules
+
 SEEDS = range(150)
 
 
 @pytest.fixture(scope="module")
 def campaign() -> Iterator[SimpleNamespace]:
-    sys.path.insert(0, str(FOLDER))
-    try:
-        yield SimpleNamespace(**{name: importlib.import_module(f"lio_campaign.{name}") for name in ("draws", "unusual")})
-    finally:
-        sys.path.remove(str(FOLDER))
-        for name in [name for name in sys.modules if name.partition(".")[0] == "lio_campaign"]:
-            del sys.modules[name]
+    with campaign_modules(draws="lio_campaign.draws", unusual="lio_campaign.unusual") as modules:
+        yield modules
 
 
 def test_every_sensor_is_drawn_and_sees_something(campaign: SimpleNamespace) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.manifolds import so3
+from boxplus.manifolds import quaternion, so3
 from boxplus.simulation import OmniLidar, RosetteLidar, SpinningLidar, mounting
 from boxplus.simulation.lidar import LidarModel
 
@@ -48,7 +48,6 @@ def any_mounting(near: bool, random: np.random.Generator) -> NDArray[np.float64]
         tilt = np.radians(random.uniform(15.0, 60.0)) * np.array([np.cos(about), np.sin(about), 0.0])
         T[:3, :3] = so3.exp(tilt) @ T[:3, :3]
     elif kind < _TILTED + _ANYHOW:
-        q = random.normal(size=4)
-        axis, w = q[1:], q[0]
-        T[:3, :3] = so3.exp(2.0 * np.arctan2(np.linalg.norm(axis), w) * axis / np.linalg.norm(axis))
+        q_wxyz = random.normal(size=4)
+        T[:3, :3] = quaternion.to_matrix(q_wxyz / np.linalg.norm(q_wxyz))
     return T

@@ -28,6 +28,11 @@ _LATE_NS = 1_000_000_000
 _MOST_REASONS = 50
 
 
+def time_of(event: CameraEvent) -> int:
+    """When an image was taken, or the first of some samples [ns]."""
+    return int(event.time_ns[0]) if isinstance(event, ImuSamples) else event.time_ns
+
+
 class CameraRecording(EventStream[CameraRecordingInfo, CameraEvent]):
     """An opened camera recording. Iterating yields its images and blocks of IMU samples in the order of time.
 

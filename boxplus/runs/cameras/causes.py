@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from boxplus.errors import RecordingError
-from boxplus.recordings.cameras.events import CameraEvent
+from boxplus.recordings.cameras.events import CameraEvent, time_of
 from boxplus.recordings.cameras.info import CameraRecordingInfo, CameraStream
 from boxplus.recordings.info import Evidence
 from boxplus.recordings.stream_checks import check_rate
@@ -94,7 +94,7 @@ def _compared(
     to_8_bits, imu = EightBits(), []
     try:
         for event in events:
-            time_ns = int(event.time_ns[0]) if isinstance(event, ImuSamples) else event.time_ns
+            time_ns = time_of(event)
             if begin_ns is None:
                 origin_ns = time_ns
                 begin_ns = time_ns if around_ns is None else max(time_ns, around_ns - round(1e9 * BEFORE_S))

@@ -20,7 +20,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
-from boxplus.systems.lidar_inertial_agreement.lidar_path.shifted_scans import shifts_show
+from boxplus.systems.lidar_inertial_agreement.lidar_path.shifted_scans import cost_of, shifts_show, unmoved_map
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns
 from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surfaces_across
 
@@ -113,10 +113,8 @@ def faces(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, ax
 
 def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig) -> bool:
     """Whether the last scans fit the first ones without any motion as well as with the one that was found."""
-    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     voxel_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), _POINTS)
-    for scan in scans[:_COMPARED]:
-        tree.insert(voxel_filter(scan.p_lidar)[1].astype(np.float64), downsample=True)
+    tree = unmoved_map(scans[:_COMPARED], voxel_filter, config)
     unmoved, moved = 0.0, 0.0
     for k in range(1, min(_COMPARED, len(scans) - 1) + 1):
         points = voxel_filter(scans[-k].p_lidar)[0]
@@ -125,7 +123,6 @@ def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: RegistrationCo
             measurement = PlaneMeasurement(points, tree, config, with_extrinsic=False)
             fit = measurement.at(x, rematch=True)
             # A point that matches nothing counts as far off: a scan that has moved away fits what is left of it.
-            share = measurement.on_map_share
-            cost = share * fit.residual_rms**2 + (1.0 - share) * config.plane_threshold**2
+            cost = cost_of(fit, measurement.on_map_share, config)
             unmoved, moved = (unmoved, moved + cost) if found else (unmoved + cost, moved)
     return unmoved <= _AS_WELL * moved

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from boxplus.errors import RecordingError
-from boxplus.recordings.cameras.events import CameraRecording
+from boxplus.recordings.cameras.events import CameraRecording, time_of
 from boxplus.recordings.info import Evidence
 from boxplus.recordings.stream_checks import check_rate, check_rejected
 from boxplus.runs.inspection.cameras.comparison import Comparison
@@ -34,7 +34,7 @@ def examine_cameras(recording: CameraRecording, report: Callable[[float], None])
         for event in recording:
             report(recording.progress)
             if origin_ns is None:
-                origin_ns = int(event.time_ns[0]) if isinstance(event, ImuSamples) else event.time_ns
+                origin_ns = time_of(event)
             if isinstance(event, ImuSamples):
                 imu.append(event)
                 continue

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.filtering.iterated_update import Information
 from boxplus.filtering.nav_state import NavState, P
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
@@ -38,11 +39,8 @@ def shifts_show(scans: Sequence[Scan], axis: NDArray[np.float64], config: Regist
     first, last = scans[:count], scans[len(scans) - count :]
     if not count or (last[0].start_ns + last[-1].end_ns - first[0].start_ns - first[-1].end_ns) * 0.5e-9 < _APART_S:
         return False
-    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     voxel_filter = VoxelFilter(max(config.scan_voxel, config.map_cell), _POINTS)
-    for scan in first:
-        tree.insert(voxel_filter(scan.p_lidar)[1].astype(np.float64), downsample=True)
-    measurements = []
+    tree, measurements = unmoved_map(first, voxel_filter, config), []
     for scan in last:
         points = voxel_filter(scan.p_lidar)[0]
         points = points[np.linalg.norm(points, axis=1) > _NEAR_M]
@@ -53,12 +51,24 @@ def shifts_show(scans: Sequence[Scan], axis: NDArray[np.float64], config: Regist
     return all(_cost(measurements, sign * shift * axis, config) > _WORSE * unmoved for shift in _SHIFTS_M for sign in (1.0, -1.0))
 
 
+def unmoved_map(scans: Sequence[Scan], voxel_filter: VoxelFilter, config: RegistrationConfig) -> IkdTree:
+    """The points of scans, thinned, as a LiDAR at rest has them."""
+    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
+    for scan in scans:
+        tree.insert(voxel_filter(scan.p_lidar)[1].astype(np.float64), downsample=True)
+    return tree
+
+
+def cost_of(fit: Information, share: float, config: RegistrationConfig) -> float:
+    """Mean square of the residuals of a scan [m²], of which a share fits something; what does not counts as far off."""
+    return share * fit.residual_rms**2 + (1.0 - share) * config.plane_threshold**2
+
+
 def _cost(measurements: Sequence[PlaneMeasurement], shift: NDArray[np.float64], config: RegistrationConfig) -> float:
-    """Mean square of the residuals of scans that are shifted (3,) [m²]; points on no plane count as far off."""
+    """What it costs to shift scans (3,) [m], added up [m²]; a scan that has left the map fits what few planes it meets."""
     x, cost = NavState.identity().pack(), 0.0
     x[P : P + 3] = shift
     for measurement in measurements:
         fit = measurement.at(x, rematch=True)
-        used = fit.used / measurement.points
-        cost += used * fit.residual_rms**2 + (1.0 - used) * config.plane_threshold**2
+        cost += cost_of(fit, fit.used / measurement.points, config)
     return cost
