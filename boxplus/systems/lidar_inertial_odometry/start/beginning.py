@@ -13,6 +13,7 @@ from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import Frame, joined_imu
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
+from boxplus.systems.lidar_inertial_agreement.lidar_path.own_surfaces import shows_little
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
@@ -66,6 +67,13 @@ class Beginning:
         turning = rest.open_turns @ self.extrinsic.R_imu_lidar.T @ self.imu.gyro.mean(axis=0)
         turns = bool(np.linalg.norm(turning) > _QUIET_TURN * np.sqrt(len(turning)))
         return not turns and (self.accel_std < _QUIET_ACCEL or _shaken_only(self.imu))
+
+    def torn(self) -> NotYet:
+        """Why there is no start on a path whose scans do not lie upon the ones before them."""
+        little = shows_little(self.scans[0], self.registration)
+        if little:
+            return NotYet(f"the surroundings do not show whether the platform moves: {little} ({self.evidence}){WAITING}")
+        return NotYet(f"the first scans do not overlap enough to see whether they move ({self.evidence}){WAITING}")
 
     def not_moving(self, why: str) -> NotYet:
         return NotYet(f"not at rest ({self.evidence}), and {why}{WAITING}")

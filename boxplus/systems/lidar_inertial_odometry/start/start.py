@@ -174,7 +174,7 @@ def _check_accelerometer(norm: float) -> None:
 def _check_path(seen: Beginning, path: LidarPath) -> None:
     """Whether the scans show how the LiDAR moved, unbroken, and the IMU was there."""
     if broken(path) or len(path) < min(len(seen.frames), 3):
-        raise NotYet(f"the first scans do not overlap enough to see whether they move ({seen.evidence}){WAITING}")
+        raise seen.torn()
     time_ns = seen.imu.time_ns
     within = int(np.count_nonzero((time_ns >= path.time_ns[0]) & (time_ns <= path.time_ns[-1])))
     if len(path) < 2 or within < _FEWEST_SAMPLES:
