@@ -75,6 +75,17 @@ def test_an_estimator_that_is_wrong_is_called_astray_and_does_not_discredit_the_
     assert f"the estimate moved by {factor * 3.0 * 2.8:.1f} m" in explained.astray.text
 
 
+@pytest.mark.parametrize("factor", [4.0, 6.0, -3.0])
+def test_a_path_that_explains_nothing_itself_calls_no_estimate_astray(factor: float) -> None:
+    """Half as fast as the truth, with a quarter of the points off; under the estimate more of them are."""
+    simulation, scans = crossing()
+    path, wrong = true_path(simulation, scans), true_twists(simulation, scans, factor)
+    begin = path.p_path_lidar[:1]
+    half = replace(path, p_path_lidar=begin + 0.5 * (path.p_path_lidar - begin))
+    assert explained_scans(half, scans, wrong, CONFIG).astray is None
+    assert explained_scans(path, scans, wrong, CONFIG).astray is not None
+
+
 def test_where_the_scene_does_not_show_the_path_no_estimate_is_astray() -> None:
     simulation, scans = crossing()
     path = replace(true_path(simulation, scans), weak=np.ones(len(scans), dtype=bool))
