@@ -29,7 +29,7 @@ from boxplus.manifolds import quaternion, so3
 from boxplus.residuals.inertial.imu_preintegration import Preintegration
 
 _SEGMENT_S = 2.5
-_SEGMENTS, _FEWEST = 3, 2  # that are averaged, and at least
+_SEGMENTS, _FEWEST = 3, 2  # that are averaged: those of the newest that come apart most, and at least
 _LEAST_WAY = 0.005  # m, of what is not known of the cameras' way
 _MOST = 3.0  # times as far as what is known explains
 _SHORT_S = 1.0  # segments that tell lengths
@@ -93,7 +93,8 @@ class InertialWatch:
         gravity: magnitude [m/s²].
 
     Attributes:
-        ratio: distance between the two, by what is known of both, over the last segments; 1 is exact, 0 before there is one.
+        ratio: distance between the two, by what is known of both, over the last two segments or three, whichever is more: the
+            first one, of which a start knows little, is no evidence for what follows. 1 is exact, 0 before there are two.
         length: by what share lengths of the cameras are longer than those of the IMU, and the standard deviation of that.
     """
 
@@ -107,7 +108,9 @@ class InertialWatch:
     @property
     def ratio(self) -> float:
         """See the class."""
-        return float(np.sqrt(np.mean(self._squares))) if len(self._squares) >= _FEWEST else 0.0
+        newest = list(self._squares)
+        means = [float(np.mean(newest[-count:])) for count in range(_FEWEST, len(newest) + 1)]
+        return float(np.sqrt(max(means, default=0.0)))
 
     @property
     def length(self) -> tuple[float, float]:

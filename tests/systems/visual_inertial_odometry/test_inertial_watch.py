@@ -78,6 +78,29 @@ def test_standing_still_for_minutes_says_nothing_of_lengths(shaking: float, bias
         assert watch.contradiction is None
 
 
+def test_a_first_segment_that_knows_little_hides_nothing_of_what_follows() -> None:
+    """As one of a start in motion, whose biases are open: whatever comes after it, it comes apart by less than it may."""
+    flight, rng = Flight(2, 12.0), np.random.default_rng(6)
+    whole, later = InertialWatch(9.81), InertialWatch(9.81)
+    begin_ns = flight.time_ns[300]
+    for k in range(300, len(flight.time_ns) - IMAGE_EVERY, IMAGE_EVERY):
+        since_s = 1e-9 * float(flight.time_ns[k] - begin_ns)
+        ends = flight.time_ns[[k - IMAGE_EVERY, k]]
+        step = Preintegration.integrate(flight.time_ns, flight.gyro, flight.accel, noise=NOISE, intervals_ns=[ends])
+        off = rng.normal(size=15) * SIGMAS
+        turn = quaternion.from_matrix(flight.R[k] @ so3.exp(off[:3]))
+        pose = np.concatenate([turn, 1.25 * flight.p[k] + off[3:6]])
+        state = np.concatenate([1.25 * flight.v[k] + off[6:9], flight.bias_accel[k] + off[12:], flight.bias_gyro[k] + off[9:12]])
+        P = np.diag((SIGMAS if since_s > 0.0 else 100.0 * SIGMAS) ** 2)
+        whole.add(pose, state, P, step)
+        if since_s >= 2.5:
+            later.add(pose, state, P, step)
+        if since_s > 8.0:
+            break
+    assert later.ratio > 3.0
+    assert whole.ratio == pytest.approx(later.ratio, rel=1e-9)
+
+
 def test_little_time_and_silence_say_nothing() -> None:
     watch = InertialWatch(9.81)
     assert watch.ratio == 0.0 and watch.contradiction is None and np.isnan(watch.length[0]) and np.isinf(watch.length[1])
