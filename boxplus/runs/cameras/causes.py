@@ -7,6 +7,7 @@ the corners of two cameras lie, tells clocks apart from mountings, and both from
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,7 +24,9 @@ from boxplus.sensors.images.eight_bits import EightBits
 from boxplus.sensors.inertial.imu import ImuSamples
 
 MAY_BE = "this may be the cause"
-_CALIBRATION = ("_shutter", "_focal_length")  # what an odometry may take for a motion, and be off by little enough to say nothing
+_CALIBRATION = ("_shutter", "_focal_length", "_imu_time_offset")  # what an odometry may take for a motion, and say nothing
+_MOUNTING = "R_imu_"
+_APART = "deg apart"
 BEFORE_S = 14.0
 """How much of a recording before an instant is looked at [s]."""
 
@@ -60,19 +63,28 @@ def likely_causes(
     return _wrong(found)
 
 
-def calibration_doubts(info: CameraRecordingInfo, events: Iterator[CameraEvent], around_ns: int) -> list[str]:
-    """Sentences about shutter and focal length of the first camera, by how far the gyroscope turns, of a run that saw no trouble.
+def calibration_doubts(
+    info: CameraRecordingInfo, events: Iterator[CameraEvent], around_ns: int, *, time_offset_s: float = 0.0
+) -> list[str]:
+    """Sentences about clock, mounting, shutter and focal length of the first camera, by how the gyroscope turns.
+
+    Of a run that saw no trouble: a motion that changes little hides all of them in velocity, scale and biases.
 
     Args:
         info, events: as of `likely_causes`.
         around_ns: the end of fourteen seconds in which the camera turns [ns].
+        time_offset_s: what the run found that is to be added to the times of the images, beside what the recording knows [s].
     """
-    compared = _compared(info, events, 1, around_ns, {})
+    compared = _compared(info, events, 1, around_ns, {}, round(1e9 * time_offset_s))
     if compared is None or not len(compared[1]):
         return []
     comparison, imu, _ = compared
-    doubtful = [finding for finding in comparison.with_imu(imu) if finding.key.endswith(_CALIBRATION)]
-    return [sentence(finding) for finding in _wrong(doubtful)]
+    return [sentence(finding) for finding in _wrong(comparison.with_imu(imu)) if _is_of_calibration(finding)]
+
+
+def _is_of_calibration(finding: Evidence) -> bool:
+    """Whether it is about what a calibration states; that both turn unlike may be too few corners, and a run without trouble."""
+    return finding.key.endswith(_CALIBRATION) or (finding.key.startswith(_MOUNTING) and finding.value.endswith(_APART))
 
 
 def _pictures(info: CameraRecordingInfo, cameras: int) -> list[CameraStream]:
@@ -80,12 +92,18 @@ def _pictures(info: CameraRecordingInfo, cameras: int) -> list[CameraStream]:
 
 
 def _compared(
-    info: CameraRecordingInfo, events: Iterator[CameraEvent], cameras: int, around_ns: int | None, views: Mapping[int, Views]
+    info: CameraRecordingInfo,
+    events: Iterator[CameraEvent],
+    cameras: int,
+    around_ns: int | None,
+    views: Mapping[int, Views],
+    late_ns: int = 0,
 ) -> tuple[Comparison, ImuSamples, int] | None:
     """The first cameras around an instant, the samples there, and when the recording begins [ns]; None where it cannot be read.
 
     Args:
         views: of each camera, where its images are to be noted as well.
+        late_ns: added to the times of the images that are compared [ns].
     """
     pictures = _pictures(info, cameras)
     rate_hz = pictures[0].count / max(info.duration_s, 1e-3)
@@ -106,7 +124,7 @@ def _compared(
                     imu.append(event)
             elif not event.is_depth and event.camera < cameras and time_ns >= begin_ns:
                 grey = to_8_bits(event.grey())
-                compared.note(event, grey)
+                compared.note(replace(event, time_ns=event.time_ns + late_ns), grey)
                 if event.camera in views:
                     views[event.camera].note(event, grey)
     except RecordingError:

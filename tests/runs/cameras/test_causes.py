@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from boxplus.manifolds import so3
 from boxplus.recordings.cameras.events import CameraEvent
 from boxplus.recordings.cameras.info import CameraRecordingInfo
 from boxplus.runs.cameras.causes import calibration_doubts, likely_causes, sentence
@@ -43,6 +44,34 @@ def test_a_clock_that_is_off_is_named_with_its_offset(recorded: tuple[CameraReco
     assert abs(offset_ms - 50.0) < 10.0
 
 
+def test_a_run_without_trouble_is_told_of_a_clock_that_it_has_not_found_itself(
+    recorded: tuple[CameraRecordingInfo, list[CameraEvent]],
+) -> None:
+    info, events = recorded
+    end_ns = max(event.time_ns for event in events if not isinstance(event, ImuSamples))
+    for late_ns, found_s, offset_ms in ((50_000_000, 0.0, 50.0), (50_000_000, 0.05, None), (0, 0.05, -50.0)):
+        said = calibration_doubts(info, (late(event, late_ns) for event in events), end_ns, time_offset_s=found_s)
+        assert len(said) == (offset_ms is not None)
+        if offset_ms is not None:
+            assert "offset of the clocks" in said[0]
+            assert float(said[0].split(" ms")[0].split()[-1]) == pytest.approx(offset_ms, abs=10.0)
+
+
+def test_a_run_without_trouble_is_told_of_a_mounting_that_the_turns_contradict(
+    recorded: tuple[CameraRecordingInfo, list[CameraEvent]],
+) -> None:
+    info, events = recorded
+    end_ns = max(event.time_ns for event in events if not isinstance(event, ImuSamples))
+    (camera,) = info.cameras
+    assert camera.T_body_camera is not None
+    T = camera.T_body_camera.copy()
+    T[:3, :3] = T[:3, :3] @ so3.exp(np.deg2rad([0.0, 15.0, 0.0]))
+    (said,) = calibration_doubts(
+        dataclasses.replace(info, cameras=[dataclasses.replace(camera, T_body_camera=T)]), iter(events), end_ns
+    )
+    assert "the stated mounting does not fit" in said
+
+
 @pytest.mark.slow
 def test_a_run_without_trouble_is_told_of_a_rolling_shutter_and_of_nothing_else(
     recorded: tuple[CameraRecordingInfo, list[CameraEvent]],
@@ -50,7 +79,6 @@ def test_a_run_without_trouble_is_told_of_a_rolling_shutter_and_of_nothing_else(
     info, events = recorded
     end_ns = max(event.time_ns for event in events if not isinstance(event, ImuSamples))
     assert calibration_doubts(info, iter(events), end_ns) == []
-    assert calibration_doubts(info, (late(event, 50_000_000) for event in events), end_ns) == []  # of the clocks others tell
     simulation = simulate_cameras("room_moving", 4, duration_s=7.5, rig=make_rig("mono", None, 0.35, 10.0))
     rolling = as_camera_recording(simulation, make_camera_fault("rolling_shutter"))
     (said,) = calibration_doubts(rolling.info, iter(rolling), end_ns)
