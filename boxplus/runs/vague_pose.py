@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 _PARTS = slice(0, 3), slice(3, 6)  # of the covariance of a pose: rotation, position
 _VAGUE_M, _VAGUE_SHARE = 0.05, 0.02  # of the way: a position less certain than both is of little use
+_UNKNOWN_M, _UNKNOWN_SHARE = 1.0, 0.2  # of no use
 
 
 def largest_sigmas(P: NDArray[np.float64]) -> tuple[float, float]:
@@ -18,6 +19,11 @@ def largest_sigmas(P: NDArray[np.float64]) -> tuple[float, float]:
 def is_vague(sigma_m: float, way_m: float) -> bool:
     """Whether a position of that standard deviation is of little use, after a way of that length."""
     return sigma_m > max(_VAGUE_M, _VAGUE_SHARE * way_m)
+
+
+def is_unknown(sigma_m: float, way_m: float) -> bool:
+    """Whether a position of that standard deviation is of no use, and with it the run."""
+    return sigma_m > max(_UNKNOWN_M, _UNKNOWN_SHARE * way_m)
 
 
 def length_text(metres: float) -> str:

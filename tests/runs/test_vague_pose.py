@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import so3
-from boxplus.runs.vague_pose import is_vague, largest_sigmas, length_text
+from boxplus.runs.vague_pose import is_unknown, is_vague, largest_sigmas, length_text
 
 
 def test_the_largest_deviations_are_those_of_the_worst_axes() -> None:
@@ -24,6 +24,13 @@ def test_a_position_is_vague_beyond_five_centimetres_and_two_hundredths_of_the_w
     sigma_m: float, way_m: float, vague: bool
 ) -> None:
     assert is_vague(sigma_m, way_m) is vague
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "way_m", "unknown"), [(0.9, 0.1, False), (1.1, 0.1, True), (1.1, 10.0, False), (2.1, 10.0, True)]
+)
+def test_a_position_is_unknown_beyond_a_metre_and_a_fifth_of_the_way(sigma_m: float, way_m: float, unknown: bool) -> None:
+    assert is_unknown(sigma_m, way_m) is unknown
 
 
 def test_lengths_are_read_in_centimetres_below_a_metre() -> None:

@@ -11,13 +11,12 @@ from boxplus.filtering.nav_state import T_THETA_L
 from boxplus.runs.estimate_statistics import EstimateStatistics, GapWatch
 from boxplus.runs.lidar_inertial.first_points import first_points_of
 from boxplus.runs.run_facts import Gap, WarningFacts
-from boxplus.runs.vague_pose import is_vague, largest_sigmas, length_text
+from boxplus.runs.vague_pose import is_unknown, is_vague, largest_sigmas, length_text
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_odometry.estimate import Estimate
 from boxplus.systems.lidar_inertial_odometry.start.beginning import WAITING
 
-_UNKNOWN_M, _UNKNOWN_SHARE = 1.0, 0.2  # of the way: a position less certain than both is of no use
 _VAGUE_DEG = 2.0  # of a rotation
 
 _LATE_S = 1.0  # a start in motion may take as long, and a second without a path is not missed
@@ -81,8 +80,7 @@ class RunStatistics(EstimateStatistics):
 
     def unknown_position(self, mounting_sigma: tuple[float, float] | None) -> str | None:
         """The same where the position is so little known that the run is not to be trusted."""
-        is_unknown = self._position_sigma_m > max(_UNKNOWN_M, _UNKNOWN_SHARE * self.path_length_m)
-        return self._told_of_pose(mounting_sigma) if is_unknown else None
+        return self._told_of_pose(mounting_sigma) if is_unknown(self._position_sigma_m, self.path_length_m) else None
 
     def _told_of_pose(self, mounting_sigma: tuple[float, float] | None) -> str | None:
         little = []

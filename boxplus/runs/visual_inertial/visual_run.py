@@ -23,7 +23,7 @@ from boxplus.runs.cameras.turning import Turning
 from boxplus.runs.inspection.imu_checks import doubt_of_gravity
 from boxplus.runs.run_facts import StartFacts, State, WarningFacts
 from boxplus.runs.run_loop import Progress
-from boxplus.runs.vague_pose import is_vague, largest_sigmas, length_text
+from boxplus.runs.vague_pose import is_unknown, is_vague, largest_sigmas, length_text
 from boxplus.runs.visual_inertial.config import VioRunConfig, dump_vio_config
 from boxplus.runs.visual_inertial.frame_log import FrameLogWriter
 from boxplus.runs.visual_inertial.rig_of_recording import rig_of_recording
@@ -176,7 +176,8 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         if state != "finished":
             return
         turning_ns = self._turning.until_ns()
-        if not self.counts.count or self._odometry.contradiction is not None or self._is_much_doubted():
+        is_to_be_trusted = self._odometry.contradiction is None and not self._is_unknown() and not self._is_much_doubted()
+        if not self.counts.count or not is_to_be_trusted:
             self.stage = "looking for the cause"
             self.show_progress()
             longest = self.counts.longest_imu_gap_s
@@ -187,9 +188,10 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
             self._causes += [sentence(finding) for finding in found]
             self._refuted = next((sentence(finding) for finding in found if finding.verdict == "error"), None)
         elif turning_ns is not None:
-            self.stage = "comparing shutter and focal length with the gyroscope"
+            self.stage = "comparing clock, mounting, shutter and focal length with the gyroscope"
             self.show_progress()
-            self._doubts = calibration_doubts(self._info, self.recording.read_again(), turning_ns)
+            again, offset_s = self.recording.read_again(), self._time_offset_s
+            self._doubts = calibration_doubts(self._info, again, turning_ns, time_offset_s=offset_s)
 
     def push(self, event: CameraEvent) -> list[VioEstimate]:
         """See `RunLoop.push`."""
@@ -277,13 +279,8 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
                 "part of the platform in view, or the middle of a circle that it moved on; they were left out"
             )
             shared["warnings"].append(WarningFacts(text=text, count=carried))
-        if is_vague(self._worst_sigma_m, counts.path_length_m):
-            text = (
-                f"by its own covariance the run knows some positions to {length_text(self._worst_sigma_m)} (1 sigma) only, of "
-                f"a way of {length_text(counts.path_length_m)}, in frames that are called ok: its start, its IMU and what it "
-                "saw tell no more"
-            )
-            shared["warnings"].append(WarningFacts(text=text, count=1))
+        if is_vague(self._worst_sigma_m, counts.path_length_m) and not self._is_unknown():
+            shared["warnings"].append(WarningFacts(text=self._told_of_position(), count=1))
         doubts = self._doubts if start is None else [*gravity_doubts(start, len(self._rig.cameras)), *self._doubts]
         shared["warnings"] += [WarningFacts(text=doubt, count=1) for doubt in doubts]
         shared["warnings"] += [WarningFacts(text=f"{MAY_BE}: {cause}", count=1) for cause in self._causes]
@@ -317,6 +314,16 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
     def _is_much_doubted(self) -> bool:
         return self._share("lost") > _MUCH_LOST or self._share("lost", "weak") > _MUCH_DOUBTED
 
+    def _is_unknown(self) -> bool:
+        return is_unknown(self._worst_sigma_m, self.counts.path_length_m)
+
+    def _told_of_position(self) -> str:
+        return (
+            f"by its own covariance the run knows some positions to {length_text(self._worst_sigma_m)} (1 sigma) only, of a way "
+            f"of {length_text(self.counts.path_length_m)}, in frames that are called ok: its start, its IMU and what it saw tell "
+            "no more"
+        )
+
     def _contradiction(self) -> str | None:
         """Why the run is not to be trusted, whatever the status of its frames; None where nothing says so."""
         if self._odometry.contradiction is not None:
@@ -324,6 +331,8 @@ class _Run(CameraRun[VioEstimate, VioSummary]):
         lost, weak = self._share("lost"), self._share("weak")
         if self._refuted is not None and self._is_much_doubted():
             return f"{lost:.0%} of the frames are lost and {weak:.0%} weak, and {self._refuted}"
+        if self._is_unknown():
+            return self._told_of_position()
         return f"{lost:.0%} of the frames are lost ({_MOST_LOST:.0%} at most)" if lost > _MOST_LOST else None
 
     def _gap_warnings(self) -> list[WarningFacts]:

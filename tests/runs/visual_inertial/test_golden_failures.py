@@ -172,6 +172,12 @@ def test_a_rolling_shutter_that_nothing_states_is_a_warning(tmp_path: Path) -> N
     assert outcome.end == "finished" and fault.named_in(outcome.said), outcome.said
 
 
+def test_clocks_apart_that_leave_no_position_known_are_named_and_not_to_be_trusted(tmp_path: Path) -> None:
+    fault = faults.imu_clock_offset(0.03)
+    outcome = run(tmp_path, fault, "stereo", 6.0, 15.0)
+    assert outcome.end == "contradicted" and fault.named_in(outcome.said), outcome
+
+
 @pytest.mark.parametrize("rig", ["stereo", "mono"])
 def test_an_object_that_fills_half_of_the_view_is_named_or_does_no_harm(tmp_path: Path, rig: Rig) -> None:
     fault = faults.moving_object(3.0, 3.0)

@@ -99,21 +99,29 @@ def test_a_run_without_trouble_says_that_its_shutter_rolls(tmp_path: Path, rolli
     assert read_vio_summary(VioFolder(tmp_path / "out").summary).warnings == summary.warnings
 
 
-def knowing_little(push: Callable[..., list[VioEstimate]]) -> Callable[..., list[VioEstimate]]:
-    """The same estimates, a thousand times as uncertain."""
-    return lambda odometry, event: [replace(one, covariance=1e6 * one.covariance) for one in push(odometry, event)]
+def knowing_little(push: Callable[..., list[VioEstimate]], times: float) -> Callable[..., list[VioEstimate]]:
+    """The same estimates, so many times as uncertain."""
+    return lambda odometry, event: [replace(one, covariance=times**2 * one.covariance) for one in push(odometry, event)]
 
 
-def test_positions_of_which_a_run_knows_little_are_told(
-    recorded: Path, finished: tuple[VioFolder, VioSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("times", "of_use"), [(100.0, True), (1000.0, False)])
+def test_positions_of_which_a_run_knows_little_are_told_and_those_of_no_use_are_not_to_be_trusted(
+    recorded: Path,
+    finished: tuple[VioFolder, VioSummary],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    times: float,
+    of_use: bool,
 ) -> None:
     assert not any("own covariance" in warning.text for warning in finished[1].warnings)
     for name in ("push_image", "push_imu"):
-        monkeypatch.setattr(VisualInertialOdometry, name, knowing_little(getattr(VisualInertialOdometry, name)))
+        monkeypatch.setattr(VisualInertialOdometry, name, knowing_little(getattr(VisualInertialOdometry, name), times))
     with open_camera_recording(recorded) as recording:
         summary = run_visual_odometry(recording, tmp_path / "out", CONFIG)
-    (text,) = (warning.text for warning in summary.warnings if "own covariance" in warning.text)
-    assert re.search(r"knows some positions to \d.* m \(1 sigma\) only, of a way of \d+ cm", text)
+    warned = [warning.text for warning in summary.warnings if "own covariance" in warning.text]
+    assert (summary.contradiction is None) == of_use == bool(warned)
+    (text,) = warned if of_use else [summary.contradiction or ""]
+    assert re.search(r"knows some positions to \d.* c?m \(1 sigma\) only, of a way of \d+ cm", text)
 
 
 def test_every_frame_with_a_state_has_a_row_everywhere(finished: tuple[VioFolder, VioSummary]) -> None:
