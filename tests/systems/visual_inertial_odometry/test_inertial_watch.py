@@ -104,7 +104,7 @@ def test_a_first_segment_that_knows_little_hides_nothing_of_what_follows() -> No
 def test_little_time_and_silence_say_nothing() -> None:
     watch = InertialWatch(9.81)
     assert watch.ratio == 0.0 and watch.contradiction is None and np.isnan(watch.length[0]) and np.isinf(watch.length[1])
-    sound, silent = watched(1, 1.25), watched(1, 1.25, silent=100)
+    sound, silent = watched(1, 1.25), watched(1, 1.25, silent=120)
     assert silent.ratio > 0.0 and silent.ratio != sound.ratio
 
 
