@@ -154,11 +154,6 @@ class MapDatum:
         self._new_share = points / self._local_points if points else 0.0
         _bring(self._new_share, self._joint)
 
-    def join(self, points: int) -> None:
-        """The map has taken in so many points more from where the last scan was made, which place what it brought together."""
-        self._new_share *= self._local_points / max(self._local_points + points, 1.0)
-        self._local_points += points
-
     def creep(self, cov: NDArray[np.float64], x: NDArray[np.float64]) -> None:
         """Widen the filter's `cov` (n, n), in place, by how the last scan has moved the local map against the pose at x (36,).
 

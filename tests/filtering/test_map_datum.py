@@ -85,27 +85,6 @@ def test_a_map_that_moves_with_the_sensor_loses_the_start() -> None:
     assert (final[1][4:] > 10.0 * final[0][4:]).all()  # across the way, by the lever of the heading
 
 
-def test_a_map_of_several_scans_from_one_place_is_placed_by_all_of_them() -> None:
-    """Of four times as many points the variance is a quarter, and a scan that follows brings a smaller share to them."""
-    x, cov = _state(np.eye(3), np.zeros(3)), 1e-16 * np.eye(24)
-    placed = []
-    for more in (0, 3000):
-        random = np.random.default_rng(0)
-        datum = MapDatum(x, cov)
-        datum.insert(1000)
-        datum.join(more)
-        assert datum.new_share == pytest.approx(1000 / (1000 + more))
-        _scan(datum, random, x, 1e2 * np.eye(24), 1e-8)
-        placed.append(datum.pose_covariance(x))
-        datum.insert(1000)
-        assert datum.new_share == pytest.approx(1000 / (2000 + more))
-    noise = placed[0] - placed[1]  # three quarters of the first map's
-    assert np.linalg.eigvalsh(noise)[0] > 0.0
-    datum = MapDatum(x, cov)
-    datum.join(0)  # nothing has been seen
-    assert datum.new_share == 0.0
-
-
 def test_a_view_that_turns_away_compares_with_what_it_brought_itself() -> None:
     """A cone looks at new places as it turns about what is across it; about its own axis, and all around, it does not."""
     turns = {"aside": np.array([0.0, 0.0, 0.1]), "about its axis": np.array([0.1, 0.0, 0.0])}

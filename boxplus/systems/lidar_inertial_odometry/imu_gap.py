@@ -19,17 +19,6 @@ def begins_blind(frame: Frame, max_gap_s: float) -> bool:
     return bool(len(before) and ((after[0] if len(after) else frame.scan.end_ns) - before[-1]) * 1e-9 > max_gap_s)
 
 
-def missing_samples(frame: Frame, max_gap_s: float) -> list[str]:
-    """What a user is told of IMU samples that a scan lacks, a sentence each."""
-    said = [] if frame.covered else ["no IMU sample at or after the end of the scan: the last one was held"]
-    if frame.largest_gap_s > max_gap_s:
-        said.append(
-            f"IMU gap of {frame.largest_gap_s:.2f} s, longer than {max_gap_s:g} s: "
-            "motion taken from the LiDAR alone, covariance widened"
-        )
-    return said
-
-
 def mean_motion(x_before: NDArray[np.float64], x: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
     """(2, 3) turn rate in the IMU frame [rad/s] and velocity in the world [m/s] that lead from one state (36,) to another."""
     moved = np.empty(TANGENT)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +28,7 @@ from boxplus.sensors.sequencer import AFTER_GAP, BEFORE_START, Frame, Sequencer,
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import WAITED, Estimate, Prediction
-from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, missing_samples, with_turn_rate
+from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
 from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
 from boxplus.systems.lidar_inertial_odometry.map_cell import map_cell_for
 from boxplus.systems.lidar_inertial_odometry.mounted_update import mounted_update
@@ -40,7 +40,6 @@ from boxplus.systems.lidar_inertial_odometry.outcome import Outcome
 from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start.first_scan import deskew_first
-from boxplus.systems.lidar_inertial_odometry.start.resting_scans import resting_scans
 from boxplus.systems.lidar_inertial_odometry.start.search import StartSearch
 from boxplus.systems.lidar_inertial_odometry.start.start import Start
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
@@ -208,18 +207,9 @@ class LidarInertialOdometry(Snapshots):
         p_lidar = deskew_first(first, found.state, self.config)
         if self._gap is None:  # for good: what flies high sees the ground only, and may do so in rings
             self._one_way = all(sees_one_way(frame.scan.p_lidar) for frame in (first, *rest))
-        self._begin_map(p_lidar, resting_scans(found, rest))
+        self._insert(found.state.to_world(self._thinned(p_lidar)[1]))
         self._warnings = [text for text in (self._gap, found.warning) if text]
         return [self._estimate(first, p_lidar), *self._advance(rest)]
-
-    def _begin_map(self, p_lidar: NDArray[np.float32], resting: Sequence[Frame]) -> None:
-        """The first scan makes the map, and those taken from the same place with it."""
-        to_world = NavState.unpack(self._x).to_world
-        self._insert(to_world(self._thinned(p_lidar)[1]))
-        first = len(self.map)
-        for frame in resting:
-            self._arrivals.insert_into(self.map, to_world(self._thinned(frame.scan.p_lidar)[1]), frame.scan.end_ns)
-        self._datum.join(len(self.map) - first)
 
     def _note_search(self) -> None:
         """Scans that no start will begin with, and why."""
@@ -349,9 +339,12 @@ class LidarInertialOdometry(Snapshots):
         return points, map_points
 
     def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:
-        settings = {"with_extrinsic": self.config.extrinsic_estimation != "off", "confirm": True, "bend_sparse": self._one_way}
+        with_extrinsic = self.config.extrinsic_estimation != "off"
         weight = _BLIND_WEIGHT if self._is_blind(frame) else 1.0
-        return PlaneMeasurement(points, self.map, self.config, weight=weight, **settings)
+        sparse = self._one_way
+        return PlaneMeasurement(
+            points, self.map, self.config, with_extrinsic=with_extrinsic, weight=weight, confirm=True, bend_sparse=sparse
+        )
 
     def _is_blind(self, frame: Frame) -> bool:
         return frame.largest_gap_s > self.config.max_imu_gap
@@ -374,7 +367,14 @@ class LidarInertialOdometry(Snapshots):
         timing_s: Mapping[str, float] | None = None,
     ) -> Estimate:
         """What is said of a scan; without an outcome it is the first one, which is exact by definition."""
-        warnings, self._warnings = self._warnings + missing_samples(frame, self.config.max_imu_gap), []
+        warnings, self._warnings = self._warnings, []
+        if not frame.covered:
+            warnings.append("no IMU sample at or after the end of the scan: the last one was held")
+        if self._is_blind(frame):
+            warnings.append(
+                f"IMU gap of {frame.largest_gap_s:.2f} s, longer than {self.config.max_imu_gap:g} s: "
+                "motion taken from the LiDAR alone, covariance widened"
+            )
         pose = self._unshown.widened(self._datum.pose_covariance(self._x), self._time_ns)
         return Estimate(
             time_ns=frame.scan.end_ns,
