@@ -14,7 +14,7 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.lidar_motion import lidar_path
 from boxplus.systems.lidar_inertial_agreement.lidar_path.other_speeds import one_speed, well_known
-from boxplus.systems.lidar_inertial_agreement.lidar_path.own_surfaces import shows_little
+from boxplus.systems.lidar_inertial_agreement.lidar_path.own_surfaces import show_little
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_odometry.motion import MotionBetween, MotionState
 from boxplus.systems.lidar_odometry.passing import passing_motion, turning_along
@@ -54,7 +54,7 @@ def find_lidar_start(scans: Sequence[Scan], config: RegistrationConfig) -> Lidar
     """
     path = lidar_path(scans, config, unbroken=True)
     if _is_broken(path):
-        little = shows_little(scans[0], config)
+        little = show_little(scans, config)
         return f"of the first {len(scans)} scans, {path.failed} cannot be registered to those before" + (
             f": {little}" if little else ""
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from boxplus.filtering.nav_state import NavState
@@ -13,6 +15,8 @@ from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.tracks.scan_fit import MOST_MAP_POINTS, MOST_POINTS
 
 _LITTLE = 0.1
+_FEWEST = 500  # points of a scan
+_NEAREST_M, _FARTHEST_M = 0.3, 300.0  # median range: points may be in another unit
 
 
 def share_on_own_surfaces(scan: Scan, config: RegistrationConfig) -> float:
@@ -31,16 +35,26 @@ def share_on_own_surfaces(scan: Scan, config: RegistrationConfig) -> float:
     return measurement.at(NavState.identity().pack(), rematch=True).used / max(len(points), 1)
 
 
-def shows_little(scan: Scan, config: RegistrationConfig) -> str:
-    """Why scans like this one cannot be laid upon each other, wherever they were taken, a clause; empty where they can.
+def show_little(scans: Sequence[Scan], config: RegistrationConfig) -> str:
+    """Why scans like these cannot be laid upon each other, wherever they were taken, a clause; empty where they can.
+
+    The one that shows most of the first, the middle and the last counts; nothing is said of scraps, and of lengths that no LiDAR
+    measures.
 
     Args:
-        scan, config: as of `share_on_own_surfaces`.
+        scans: consecutive sweeps, at least one; config: as of `share_on_own_surfaces`.
     """
-    share = share_on_own_surfaces(scan, config)
+    some = [scans[0], scans[len(scans) // 2], scans[-1]]
+    if any(len(scan) < _FEWEST or not _NEAREST_M < _median_range(scan) < _FARTHEST_M for scan in some):
+        return ""
+    share = max(share_on_own_surfaces(scan, config) for scan in some)
     if share >= _LITTLE:
         return ""
     return (
         f"only {100.0 * share:.0f} % of the points of a scan lie on a surface that it shows, too few to lay one scan upon "
         "another (few rings on bare ground, or too little near)"
     )
+
+
+def _median_range(scan: Scan) -> float:
+    return float(np.median(np.linalg.norm(scan.p_lidar, axis=1)))

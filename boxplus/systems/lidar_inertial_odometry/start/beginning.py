@@ -13,7 +13,7 @@ from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import Frame, joined_imu
 from boxplus.systems.lidar_inertial_agreement.agreement import gyro_guesses
-from boxplus.systems.lidar_inertial_agreement.lidar_path.own_surfaces import shows_little
+from boxplus.systems.lidar_inertial_agreement.lidar_path.own_surfaces import show_little
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for
 from boxplus.systems.lidar_inertial_agreement.rest import Rest
@@ -70,7 +70,7 @@ class Beginning:
 
     def torn(self) -> NotYet:
         """Why there is no start on a path whose scans do not lie upon the ones before them."""
-        little = shows_little(self.scans[0], self.registration)
+        little = show_little(self.scans, self.registration)
         if little:
             return NotYet(f"the surroundings do not show whether the platform moves: {little} ({self.evidence}){WAITING}")
         return NotYet(f"the first scans do not overlap enough to see whether they move ({self.evidence}){WAITING}")

@@ -12,7 +12,7 @@ from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, mo
 from boxplus.simulation.motions import trajectories
 from boxplus.simulation.worlds import sites, worlds
 from boxplus.simulation.worlds.world import World
-from boxplus.systems.lidar_inertial_agreement.lidar_path.own_surfaces import share_on_own_surfaces, shows_little
+from boxplus.systems.lidar_inertial_agreement.lidar_path.own_surfaces import share_on_own_surfaces, show_little
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.start.start import find_start
@@ -32,7 +32,7 @@ def test_sixteen_rings_in_a_field_show_little(seed: int, noise_m: float) -> None
     scan = _at_rest(sites.open_field(2, seed=seed), 16, noise_m).scan(3)
     settings = with_cells_for(scan, LioConfig())
     assert 0.0 < share_on_own_surfaces(scan, settings) < 0.1
-    assert shows_little(scan, settings).startswith(f"only {100.0 * share_on_own_surfaces(scan, settings):.0f} % of ")
+    assert show_little([scan], settings).startswith(f"only {100.0 * share_on_own_surfaces(scan, settings):.0f} % of ")
 
 
 @pytest.mark.parametrize(
@@ -42,12 +42,30 @@ def test_sixteen_rings_in_a_field_show_little(seed: int, noise_m: float) -> None
 )
 def test_elsewhere_and_with_more_of_them_they_show_enough(world: World, channels: int) -> None:
     scan = _at_rest(world, channels).scan(3)
-    assert shows_little(scan, with_cells_for(scan, LioConfig())) == ""
+    assert show_little([scan], with_cells_for(scan, LioConfig())) == ""
 
 
 def test_an_empty_scan_shows_nothing() -> None:
     scan = Scan.from_arrays(np.zeros((0, 3), np.float32), np.zeros(0, np.int64))
     assert share_on_own_surfaces(scan, LioConfig()) == 0.0
+
+
+@pytest.mark.parametrize("factor", [1000.0, 0.001])
+def test_nothing_is_said_of_points_that_are_not_in_metres(factor: float) -> None:
+    scan = _at_rest(worlds.room(), 16).scan(3)
+    other = Scan.from_arrays(scan.p_lidar * np.float32(factor), scan.time_ns)
+    assert share_on_own_surfaces(other, LioConfig()) < 0.1
+    assert show_little([other], LioConfig()) == ""
+
+
+def test_a_scrap_is_no_scan_and_one_poor_scan_not_all() -> None:
+    simulation = _at_rest(worlds.room(), 16)
+    scan, field = simulation.scan(3), _at_rest(sites.open_field(2, seed=0), 16).scan(3)
+    scrap = Scan.from_arrays(scan.p_lidar[:20], scan.time_ns[:20])
+    assert share_on_own_surfaces(scrap, LioConfig()) < 0.1
+    assert show_little([scrap, scrap], LioConfig()) == ""
+    assert show_little([field, scan, field], LioConfig()) == ""
+    assert show_little([field, field, field], LioConfig())
 
 
 def test_a_start_that_is_refused_says_so() -> None:
