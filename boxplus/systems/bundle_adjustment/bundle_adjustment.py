@@ -25,6 +25,7 @@ from boxplus.systems.bundle_adjustment.config import BundleAdjustmentConfig
 from boxplus.systems.bundle_adjustment.depth import NOT_APART, DepthUncertainty, depth_uncertainty
 from boxplus.systems.bundle_adjustment.doubts.bent import bent_doubt
 from boxplus.systems.bundle_adjustment.doubts.ending import unconverged_findings
+from boxplus.systems.bundle_adjustment.doubts.focal_lengths import focal_lengths
 from boxplus.systems.bundle_adjustment.doubts.lens import lens_finding, lens_of_start
 from boxplus.systems.bundle_adjustment.doubts.pixel_origin import pixel_origin
 from boxplus.systems.bundle_adjustment.doubts.plausibility import (
@@ -200,6 +201,11 @@ def adjust_bundle(
     )
     if lens is not None and not lens.is_grave:
         notes.append(lens.sentence)
+    lengths = focal_lengths(adjusted, sound.used, sound.cheirality.dropped, config, loss, errors, solution, left)
+    unknown = None if lengths is None or not depth.cameras_move_apart else lengths.sentence
+    is_unknown = unknown is not None and lengths is not None and lengths.is_grave
+    if unknown is not None and not is_unknown:
+        notes.append(unknown)
     unconverged, late = unconverged_findings(solution, points, depth.undetermined, ids)
     notes += late
     said = [
@@ -211,6 +217,7 @@ def adjust_bundle(
         mirror_doubt(reconstruction.points[seen], adjusted.points[seen]),
         None if lens is None or not lens.is_grave else lens.sentence,
         origin.doubt,
+        unknown if is_unknown else None,
     ]
     return BundleAdjustmentResult(
         reconstruction=adjusted,

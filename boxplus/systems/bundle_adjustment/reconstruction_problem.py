@@ -133,12 +133,16 @@ def free_parameters(
     return free, layout[:, ~free] @ model.camera_params[number][~free], layout[:, free]
 
 
+def lens_blocks(model: ColmapModel, problem: Problem) -> dict[int, Variables]:
+    """The intrinsics that are refined as variables, by the number of their camera."""
+    numbers = {_intrinsics_name(name): number for number, name in enumerate(model.camera_ids)}
+    return {numbers[block.name]: block for block in problem.blocks if block.name in numbers}
+
+
 def _refined_intrinsics(model: ColmapModel, problem: Problem, solution: Solution) -> Iterator[tuple[int, NDArray[np.float64]]]:
     """Which camera, and what came out of its parameters that were refined, of those that have any."""
-    numbers = {_intrinsics_name(name): number for number, name in enumerate(model.camera_ids)}
-    for block in problem.blocks:
-        if block.name in numbers:
-            yield numbers[block.name], solution[block][0]
+    for number, block in lens_blocks(model, problem).items():
+        yield number, solution[block][0]
 
 
 def turned_lenses(

@@ -120,7 +120,7 @@ def sigma_notes(errors: NDArray[np.float64], sigma_px: float, left: int, *, is_g
         left: measurements less unknowns.
         is_given: whether somebody meant sigma, or it is the default.
     """
-    noise = _noise(errors, left)
+    noise = pixel_noise(errors, left)
     off = _OFF_GIVEN if is_given else _OFF
     if noise is None or sigma_px / off <= noise <= off * sigma_px:
         return []
@@ -136,7 +136,7 @@ def coarse_doubt(
     errors: NDArray[np.float64], left: int, reconstruction: Reconstruction, sigma_px: float, *, is_given: bool
 ) -> str | None:
     """Where the typical error is none of a camera, or of the sigma that somebody meant, with or without a robust loss."""
-    noise, focal = _noise(errors, left), Sightings.of(reconstruction).focal_length
+    noise, focal = pixel_noise(errors, left), Sightings.of(reconstruction).focal_length
     if noise is None:
         return None
     if noise > max(_COARSE * focal, sigma_px):
@@ -152,7 +152,7 @@ def coarse_doubt(
     return None
 
 
-def _noise(errors: NDArray[np.float64], left: int) -> float | None:
+def pixel_noise(errors: NDArray[np.float64], left: int) -> float | None:
     """Standard deviation of a pixel as the median of the errors has it [px]; None where nothing is left over to tell."""
     known = errors[np.isfinite(errors)]
     if left <= 0 or not len(known):
