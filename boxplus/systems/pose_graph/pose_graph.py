@@ -258,7 +258,7 @@ def optimize_pose_graph(
             kept = np.ones(len(graph.edges), dtype=np.bool_) if verdict is None else verdict.is_kept
             reliability = Reliability.of(with_edges(graph, kept), solution, poses)
             if reliability is not None:
-                found = suspicions(reliability, solution, poses, follow[kept])
+                found = suspicions(reliability, solution, follow[kept])
                 notes += wide_notes(graph, reliability, fit)
     is_at_end = solution.status == "converged" or solution.limit == "steps"  # a small χ² is none of a start
     if config.examine and verdict is None and loss is None and config.objective == "logarithm" and is_at_end:

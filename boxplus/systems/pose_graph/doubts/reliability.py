@@ -9,9 +9,7 @@ over all edges: its size is bᵀe / bᵀSb.
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,11 +18,9 @@ from numpy.typing import NDArray
 from boxplus._chi_square import chi_square_cdf, chi_square_exceeded, chi_square_quantile
 from boxplus.errors import SingularProblemError
 from boxplus.formats.graphs.pose_graph import PoseGraph
-from boxplus.manifolds import se2, se3
-from boxplus.manifolds.se2 import SE2
-from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.solution import Solution
 from boxplus.optimization.terms.variables import Variables
+from boxplus.systems.pose_graph.doubts.common_errors import common_errors
 from boxplus.systems.pose_graph.doubts.contradiction import Contradiction
 from boxplus.systems.pose_graph.doubts.fit import Fit, edge_names
 from boxplus.systems.pose_graph.problem import odometry_order, residual_of
@@ -34,16 +30,13 @@ Floats = NDArray[np.float64]
 _STRANGE = 1e-4  # chance that an edge of a sound graph, the worst of all, is told
 _SURE = 1e-6  # chance that anything else is
 _UNCHECKED = 1e-5  # share of an error that shows, below which nothing checks that direction
-_SHOWN = 1e-3  # share of a common error of all steps, below which the curvature of noisy poses shows as much of one
 _ROUNDING = 1e-15  # of the covariances that such a share is a small difference of
 _ALIKE = 9.2  # difference of squares by which one suspect is a hundred times likelier than another
 BENT = 4.0  # standard deviations of the result by which it has to be off, for it not to be trusted
-_LEAST_STEPS = 10  # of odometry, for a scale or a drift of its own
 _LEAST_SPARE = 10.0  # redundancy from which on a group of edges is judged on its own
 _NONE_LEFT = 0.5  # redundancy, which is a whole number but for rounding
 _CLEARLY, _WRONG = 1.5, 4.0  # times what the information promises of a group's χ², to be told, and not to be trusted
 _SLACK = 0.25
-_STEP = 1e-6  # of differences by a scale and by an angle [rad]
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,8 +127,8 @@ class Suspicion:
     is_grave: bool
 
 
-def suspicions(known: Reliability, solution: Solution, variables: Variables, odometry: NDArray[np.bool_]) -> list[Suspicion]:
-    """Edges that all others contradict, odometry that is off as a whole, and groups that their information does not fit.
+def suspicions(known: Reliability, solution: Solution, odometry: NDArray[np.bool_]) -> list[Suspicion]:
+    """Edges that all others contradict, what odometry or loop closures are off by in common, and groups that do not fit.
 
     Args:
         odometry: (m,) edges that join successive poses.
@@ -157,13 +150,16 @@ def suspicions(known: Reliability, solution: Solution, variables: Variables, odo
         return min(usual, max((total - explained) / spare, 1.0)) if spare > _NONE_LEFT else 1.0
 
     worst = int(np.argmax(squared))
-    common = _systematic(known, solution, variables, odometry) if np.count_nonzero(odometry) >= _LEAST_STEPS else []
-    whole = max(common, key=lambda one: one.squared, default=None)
+    common = common_errors(known, solution, odometry)
+    best = max((one.squared for one in common), default=0.0)
     said = []
-    if whole is not None and whole.squared >= squared[worst]:
-        scale = noise(whole.squared, 1)
-        if whole.squared > scale * chi_square_exceeded(_STRANGE / len(common), 1):
-            said.append(whole.suspicion(scale))
+    if common and best >= squared[worst]:
+        # What odometry is off by, loop closures that are off the other way explain as well: it comes first.
+        alike = [one for one in common if one.squared > best - _ALIKE]
+        whole, scale = alike[0], noise(best, 1)
+        if whole.squared > scale * chi_square_exceeded(_STRANGE / whole.tried, 1):
+            other = f"; or {alike[1].name} by {alike[1].told(scale)}" if len(alike) > 1 else ""
+            said.append(Suspicion(whole.sentence(scale) + other, max(one.bent for one in alike) > BENT))
     else:
         scale = noise(float(squared[worst]), int(directions[worst]))
         limits = np.array([math.inf, *(chi_square_exceeded(_STRANGE / len(squared), k) for k in range(1, d + 1))])
@@ -189,95 +185,6 @@ def _slipped(known: Reliability, squared: Floats, bent: Floats, found: NDArray[n
     if others > 0:
         told += f", and {others} more are contradicted"
     return Suspicion(f"{told}: it slipped, joins the wrong poses, or claims too much", bool(bent[worst] > BENT))
-
-
-@dataclass(frozen=True, slots=True)
-class Common:
-    """An error that all steps of the odometry may share.
-
-    Attributes:
-        sentence: what it is.
-        unit: factor to what it is told in.
-        size, spare: by how much, and the inverse of its variance.
-        bent: by how many of its own standard deviations the result is off at most, if this is so.
-    """
-
-    sentence: str
-    unit: float
-    size: float
-    spare: float
-    bent: float
-
-    @property
-    def squared(self) -> float:
-        """By how much χ² would fall."""
-        return self.size**2 * self.spare
-
-    def suspicion(self, scale: float) -> Suspicion:
-        """With errors that are √scale times what their information promises."""
-        return Suspicion(
-            f"{self.sentence} by {self.unit * self.size:.3g} ± {self.unit * math.sqrt(scale / self.spare):.2g}, as all edges "
-            f"together have it and their information does not know; the result is bent by up to {self.bent:.2g} of its own "
-            "standard deviations",
-            self.bent > BENT,
-        )
-
-
-def _systematic(known: Reliability, solution: Solution, variables: Variables, odometry: NDArray[np.bool_]) -> list[Common]:
-    """All steps of the odometry are too long or too short, or turn too far, by the same."""
-    found = []
-    for sentence, unit, b in _shapes(known, odometry):
-        slopes = _scattered(known, b)
-        (response,) = solution.response([slopes], is_determined=True)
-        length = float((b * b).sum())
-        spare = length - float((slopes * response).sum())
-        if not spare > _SHOWN * length:
-            continue
-        size = float((b * known.errors).sum()) / spare
-        with np.errstate(divide="ignore", invalid="ignore"):
-            bent = np.abs(response * size) / known.deviations
-        found.append(Common(sentence, unit, size, spare, float(np.nanmax(bent, initial=0.0))))
-    return found
-
-
-def _shapes(known: Reliability, odometry: NDArray[np.bool_]) -> list[tuple[str, float, Floats]]:
-    """What the odometry may be off by, with the factor to the unit it is told in and its shape (m, d) in the whitened errors.
-
-    By the steps of the result, as those that were measured hold the very noise that they would be compared with; what the result
-    has of it is at right angles to the errors.
-    """
-    graph = known.graph
-    manifold, group = (SE3, se3) if graph.dimension == 3 else (SE2, se2)
-    i, j = graph.edges[odometry].T
-    steps: Floats = group.compose(group.inverse(known.poses[i]), known.poses[j])
-    turns, W = 3 if graph.dimension == 3 else 1, known.factors[odometry]
-
-    def shape(moved: Callable[[float], Floats]) -> Floats:
-        b = np.zeros_like(known.errors)
-        change = manifold.boxminus(steps, moved(_STEP)) - manifold.boxminus(steps, moved(-_STEP))
-        b[odometry] = np.einsum("nab,nb->na", W, change / (2.0 * _STEP))
-        return b
-
-    def stretched(by: float) -> Floats:
-        moved: Floats = steps.copy()
-        moved[:, -graph.dimension :] *= 1.0 + by
-        return moved
-
-    found = [("steps of the odometry are too long, in %,", 100.0, shape(stretched))]
-    for axis in range(turns):
-        about = f" about {'xyz'[axis]}" if turns == 3 else ""
-        one = np.eye(manifold.dof)[axis]
-        by_turn = functools.partial(lambda one, by: manifold.boxplus(steps, by * one[None]), one)
-        found.append((f"steps of the odometry turn too far{about}, in degrees,", math.degrees(1.0), shape(by_turn)))
-    return found
-
-
-def _scattered(known: Reliability, b: Floats) -> Floats:
-    """Jᵀ b (n, d)."""
-    slopes = np.zeros((len(known.poses), b.shape[1]))
-    for rows, J in zip(known.graph.edges.T, known.jacobians, strict=True):
-        np.add.at(slopes, rows, np.einsum("nab,na->nb", J, b))
-    return slopes
 
 
 def _groups(known: Reliability, odometry: NDArray[np.bool_]) -> list[Suspicion]:

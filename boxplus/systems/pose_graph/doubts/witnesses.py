@@ -68,7 +68,7 @@ def held_against_each_other(
         return said
     if loss is not None and not loss.is_redescending and not counted.all():
         said += _pulled(known, poses, graph, ~counted)
-    return said + suspicions(known, solution, variables, consecutive_edges(graph)[counted])
+    return said + suspicions(known, solution, consecutive_edges(graph)[counted])
 
 
 def _pulled(known: Reliability, poses: NDArray[np.float64], graph: PoseGraph, doubtful: NDArray[np.bool_]) -> list[Suspicion]:
