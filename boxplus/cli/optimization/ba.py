@@ -94,7 +94,8 @@ def ba(
 
     The result is written in the format of the input, and as scene.ply (points and camera centres). Exit codes: 0 done, 1 the
     problem does not determine its variables or the results could not be written, 2 bad input, 3 finished but not to be trusted
-    (points behind cameras, cameras that do not move apart), 130 interrupted (results up to there are complete).
+    (points behind cameras, cameras that do not move apart, focal lengths that the images do not tell), 130 interrupted (results
+    up to there are complete).
     """
     with uncollected():
         from boxplus.cli.optimization.ba_lines import adjust_line_set, is_line_set
