@@ -65,7 +65,7 @@ def alignment_doubts(
     constant = float(np.degrees(np.linalg.norm(mean)))
     scatter = scatter_deg(np.broadcast_to(np.eye(3), R.shape), R)
     loose = _loose(association.ground_truth, alignment, rmse, wide)
-    w_first = _w_first(association.estimate, association.ground_truth, alignment, scatter)
+    w_first = _w_first(association.estimate, association.ground_truth, alignment, scatter, rmse)
     if w_first is not None:
         doubts.append(w_first)
     elif alignment.kind == "none" and (worlds := _worlds(association, scatter)) is not None:
@@ -172,14 +172,19 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
         )
         return
     # Where positions differ, too, what makes them differ turns them.
-    if _w_first(estimate, truth, alignment, scatter) is None and rmse < _FITS * alignment.spread_m[0]:
+    if _w_first(estimate, truth, alignment, scatter, rmse) is None and rmse < _FITS * alignment.spread_m[0]:
         yield (
             f"the orientations scatter by {scatter:.0f}° against the ground truth's: another convention, or none; "
             "look at the positions alone"
         )
 
 
-def _w_first(estimate: Trajectory, truth: Trajectory, alignment: Alignment, scatter: float) -> str | None:
+def _may_turn(alignment: Alignment, rmse: float, angle_deg: float) -> bool:
+    """Whether a path is so straight that the alignment may be off by this angle about it, for positions off by `rmse`."""
+    return bool(alignment.kind in ("se3", "sim3") and np.degrees(rmse) > angle_deg * alignment.spread_m[1])
+
+
+def _w_first(estimate: Trajectory, truth: Trajectory, alignment: Alignment, scatter: float, rmse: float) -> str | None:
     """A sentence where orientations agree clearly better with other columns; of a body that turns little, they hardly scatter.
 
     Args:
@@ -193,7 +198,7 @@ def _w_first(estimate: Trajectory, truth: Trajectory, alignment: Alignment, scat
         "both files": scatter_deg(R @ swapped[0], swapped[1]),
     }
     way = min(ways, key=lambda name: ways[name])
-    if alignment.kind == "none":  # worlds that nobody laid over each other turn the differences: orientations may agree in one
+    if alignment.kind == "none" or _may_turn(alignment, rmse, scatter):  # worlds that are turned turn the bodies apart
         scatter = min(scatter, scatter_deg(world_turn(estimate, truth) @ estimate.R, truth.R))
     if not (scatter > _CONSTANT_DEG and ways[way] < _CLEARLY * scatter):
         return None

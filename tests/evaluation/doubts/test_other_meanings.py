@@ -199,3 +199,32 @@ def test_many_poses_take_no_square_of_memory():
     R = so3.exp(np.stack([0.0 * t, 0.1 * np.sin(t), 0.1 * t], 1))
     way = Trajectory(stamps, p, quaternion.from_matrix(R))
     assert evaluate(way, way, deltas=()).warnings == ()
+
+
+def corridor(seed: int, *, drift_m: float) -> Trajectory:
+    """Two minutes along a corridor and back, with a turn on the spot, sways of a few degrees, and drift."""
+    rng = np.random.default_rng(seed)
+    t = 0.05 * np.arange(2400)
+    p = np.stack([40.0 * (1.0 - np.abs(t / 60.0 - 1.0)), 0.1 * np.sin(0.5 * t), 0.0 * t], 1)
+    yaw = np.pi / (1.0 + np.exp(-8.0 * (t - 60.0)))
+    R = so3.exp(np.stack([0.0 * t, 0.0 * t, yaw], 1)) @ so3.exp(
+        np.stack([0.05 * np.sin(1.3 * t), 0.04 * np.sin(1.1 * t), 0.0 * t], 1)
+    )
+    steps = rng.standard_normal((2, len(t), 3)) * [[[0.22 * drift_m]], [[0.02 * drift_m]]]
+    p, R = p + np.cumsum(0.1 * steps[0], axis=0), so3.exp(np.cumsum(0.1 * steps[1], axis=0)) @ R
+    stamps = (1_700_000_000_000_000_000 + np.round(1e9 * t)).astype(np.int64)
+    return Trajectory(stamps, p, quaternion.from_matrix(R))
+
+
+@pytest.mark.parametrize("seed", [1, 3, 5, 7, 9, 11])
+@pytest.mark.parametrize("is_cut", [False, True])
+def test_a_straight_way_back_and_forth_is_not_taken_for_other_columns(seed, is_cut):
+    """The alignment's rotation about it is drift, and turns the bodies apart by as much one way as the other."""
+    truth, estimate = corridor(seed, drift_m=0.0), corridor(seed, drift_m=0.1)
+    if is_cut:
+        seen = np.r_[0:600, 1600:2400]
+        estimate = Trajectory(estimate.time_ns[seen], estimate.p[seen], estimate.q_wxyz[seen])
+    told = " // ".join(evaluate(estimate, truth).warnings)
+    assert "are taken for qw" not in told and "conjugate" not in told
+    swapped = replace(estimate, q_wxyz=np.ascontiguousarray(estimate.q_wxyz[:, [3, 0, 1, 2]]))
+    assert "quaternions of the estimate are taken for qw" in " // ".join(evaluate(swapped, truth).warnings)
