@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from boxplus.manifolds import so3
 from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
 from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.systems.lidar_inertial_agreement.held_back import turns_held_back
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.scan_pairs import scan_pairs
 
@@ -171,6 +172,9 @@ def compare_rotations(path: LidarPath, imu: ImuSamples, R_expected: NDArray[np.f
     changes = 3.0 * count * _change_variance(imu, float(np.median(step_s))) / unit**2
     covariance = _covariance(_without_noise_of_changes(H / variance, changes / variance, count), noise / variance, count)
     covariance += np.diag(_FLOOR**2)
+    held = turns_held_back(path)
+    covariance[SCALE, SCALE] += held**2
+    covariance[:3, :3] += (0.5 * held) ** 2 * np.eye(3)  # less of a turn about one of two axes bends what both make by half of it
     centred = rate_lidar - rate_lidar.mean(axis=0)
     power = np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred))[::-1], 0.0)
     total = float((centred**2).sum())

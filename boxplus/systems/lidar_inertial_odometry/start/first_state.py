@@ -82,15 +82,28 @@ def static_state(imu: ImuSamples, extrinsic: NavState, config: LioConfig) -> tup
         extrinsic.R_imu_lidar,
         extrinsic.p_imu_lidar,
     )
-    gyro_sigma = max(float(imu.gyro.std(axis=0).max()) / np.sqrt(len(imu)), 1e-4)
+    turned, speed = _swing(imu)
+    gyro_sigma = max(float(imu.gyro.std(axis=0).max()) / np.sqrt(len(imu)), turned, 1e-4)
     # The mean of a shaken accelerometer is not better known than its samples are many.
     gravity_sigma = float(np.hypot(0.1, 2.0 * imu.accel.std(axis=0).max() / np.sqrt(len(imu))))
     covariance = _first_covariance(
-        config, gyro_sigma=gyro_sigma, accel_sigma=0.1, velocity_sigma=0.01, gravity_sigma=gravity_sigma
+        config, gyro_sigma=gyro_sigma, accel_sigma=0.1, velocity_sigma=max(speed, 0.01), gravity_sigma=gravity_sigma
     )
     if config.extrinsic_estimation != "off":
         covariance = with_mounting(covariance, first_sensitivity(state.pack()))
     return state, covariance
+
+
+def _swing(imu: ImuSamples) -> tuple[float, float]:
+    """How a platform that ends as it began swings meanwhile: amplitudes of turn over the time watched [rad/s] and speed [m/s].
+
+    A mean turn rate is off by what the platform turned from the first sample to the last, and at the instant of the first state
+    it may be anywhere in its swing. Vibration, tens of times a second, adds up to nothing.
+    """
+    seconds = np.diff(imu.time_ns, prepend=imu.time_ns[0])[:, None] * 1e-9
+    turn, speed = (np.cumsum((part - part.mean(axis=0)) * seconds, axis=0) for part in (imu.gyro, imu.accel))
+    watched = max(float(seconds.sum()), 1e-3)
+    return float(np.sqrt(2.0) * turn.std(axis=0).max()) / watched, float(np.sqrt(2.0) * speed.std(axis=0).max())
 
 
 def moving_fit(

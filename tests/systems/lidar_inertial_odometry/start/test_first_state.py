@@ -7,9 +7,11 @@ import pytest
 
 from boxplus.evaluation.nees import nees, nees_band
 from boxplus.filtering.nav_state import T_BA, T_BW, T_G, T_V
+from boxplus.manifolds import so3
 from boxplus.simulation import ImuModel, Scenario, Simulation
 from boxplus.simulation.motions import manoeuvres, trajectories
-from boxplus.simulation.motions.spline import Trajectory
+from boxplus.simulation.motions.spline import SplineTrajectory, Trajectory
+from boxplus.simulation.motions.trajectories import START_NS, control_times
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start
@@ -39,6 +41,29 @@ def started(motion: Trajectory, seed: int, imu: ImuModel) -> tuple[Start, np.nda
     )
     of = np.r_[T_V : T_V + 3, T_G : T_G + 3, T_BA : T_BA + 3, T_BW : T_BW + 3]
     return found, error, found.covariance[np.ix_(of, of)]
+
+
+def _swaying(seed: int) -> Trajectory:
+    """By 1 cm and 0.6 deg once a second, as who stands and holds a sensor."""
+    random, time_s = np.random.default_rng(seed), control_times(3.0, 0.05)
+    along, about = (v / np.linalg.norm(v) for v in random.normal(size=(2, 3)))
+    swing = [np.sin(2.0 * np.pi * time_s + phase)[:, None] for phase in random.uniform(0.0, 2.0 * np.pi, 2)]
+    p = np.array([-5.0, -2.0, 1.5]) + 0.01 * swing[0] * along
+    return SplineTrajectory(START_NS, 0.05, so3.exp(0.01 * swing[1] * about), p)
+
+
+def test_a_platform_that_sways_at_rest_is_as_fast_and_turns_as_it_says() -> None:
+    """Somewhere in its swing it moves with up to 6 cm/s, and its mean turn rate is no bias."""
+    deviations_of = []
+    for seed in range(6):
+        found, error, P = started(_swaying(seed), seed, ImuModel())
+        assert found.kind == "static"
+        deviations_of.append(error / np.sqrt(P.diagonal()))
+    velocity, bias = np.array(deviations_of)[:, :3], np.array(deviations_of)[:, 9:]
+    assert 0.2 < np.sqrt((velocity**2).mean()) < 1.5
+    assert np.abs(velocity).max() < 3.0
+    assert 0.1 < np.sqrt((bias**2).mean()) < 1.5
+    assert np.abs(bias).max() < 3.0
 
 
 @pytest.mark.slow

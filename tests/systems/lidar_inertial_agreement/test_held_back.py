@@ -1,0 +1,60 @@
+"""A platform that sways by a centimetre contradicts neither lengths nor gyroscope; one that walks shows both as before."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from boxplus.manifolds import so3
+from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation, SpinningLidar
+from boxplus.simulation.motions.spline import SplineTrajectory
+from boxplus.simulation.motions.trajectories import START_NS, control_times
+from boxplus.simulation.worlds import worlds
+from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
+from boxplus.systems.lidar_inertial_agreement.held_back import held_back, turns_held_back
+from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld
+
+RINGS = SpinningLidar(channels=32, azimuth_steps=450, vertical_fov_deg=(-30.0, 30.0))
+ROSETTE = RosetteLidar(points_per_scan=3000)
+
+
+def _swaying(shift_m: float, turn_rad: float, lidar: RosetteLidar | SpinningLidar, seed: int) -> Agreement:
+    """Once a second, in a room of 5 by 4 m."""
+    time_s, random = control_times(4.5, 0.05), np.random.default_rng(seed)
+    along, about = (v / np.linalg.norm(v) for v in random.normal(size=(2, 3)))
+    swing = [np.sin(2.0 * np.pi * time_s + phase)[:, None] for phase in random.uniform(0.0, 2.0 * np.pi, 2)]
+    p = np.array([-1.0, 0.5, 1.2]) + shift_m * swing[0] * along
+    motion = SplineTrajectory(START_NS, 0.05, so3.exp(turn_rad * swing[1] * about), p)
+    room = worlds.room((5.0, 4.0, 3.0), seed=seed)
+    scans, imu = data(Simulation(Scenario("sways", room, motion, lidar, ImuModel(), T_imu_lidar=np.eye(4)), seed, 4.0))
+    return compare_sensors(scans, imu, CONFIG, T_declared=np.eye(4))
+
+
+@pytest.mark.parametrize(("shift_m", "turn_rad"), [(0.01, 0.01), (0.02, 0.03)])
+@pytest.mark.parametrize("lidar", [RINGS, ROSETTE], ids=["rings", "rosette"])
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_platform_that_sways_contradicts_nothing(
+    shift_m: float, turn_rad: float, lidar: RosetteLidar | SpinningLidar, seed: int
+) -> None:
+    agreement = _swaying(shift_m, turn_rad, lidar, seed)
+    assert contradictions(agreement, np.eye(4)) == []
+    translation, rotation = agreement.translation, agreement.rotation
+    assert translation is not None and rotation is not None
+    assert translation.signal_m < 0.01
+    assert abs(translation.slope - 1.0) < 2.0 * translation.slope_std
+    assert abs(rotation.scale - 1.0) < 3.0 * rotation.scale_std
+
+
+def test_a_walk_holds_hardly_anything_back() -> None:
+    simulation = handheld(2, seconds=4.0)
+    scans, imu = data(simulation)
+    agreement = compare_sensors(scans, imu, CONFIG, T_declared=simulation.T_imu_lidar)
+    assert agreement.translation is not None
+    assert agreement.translation.signal_m > 0.01
+    assert turns_held_back(agreement.path) < 0.002
+
+
+@pytest.mark.parametrize(("error", "signal", "part"), [(1.0, 1.0, 0.5), (1.0, 3.0, 0.25), (1.0, 0.0, 1.0), (0.0, 0.0, 0.0)])
+def test_as_much_as_the_error_is_of_both_together(error: float, signal: float, part: float) -> None:
+    assert held_back(error, signal) == pytest.approx(part)
