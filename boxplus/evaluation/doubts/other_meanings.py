@@ -155,6 +155,8 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
                 "nothing"
             )
             return
+    if _may_turn(alignment, rmse, scatter):
+        scatter = min(scatter, scatter_deg(world_turn(estimate, truth) @ estimate.R, truth.R))
     if scatter < _FAR_DEG:
         return
     conjugates = {

@@ -228,3 +228,12 @@ def test_a_straight_way_back_and_forth_is_not_taken_for_other_columns(seed, is_c
     assert "are taken for qw" not in told and "conjugate" not in told
     swapped = replace(estimate, q_wxyz=np.ascontiguousarray(estimate.q_wxyz[:, [3, 0, 1, 2]]))
     assert "quaternions of the estimate are taken for qw" in " // ".join(evaluate(swapped, truth).warnings)
+
+
+@pytest.mark.parametrize("seed", [20, 21, 22, 23, 24])
+def test_nor_for_another_convention_where_it_drifts_farther(seed):
+    truth, estimate = corridor(seed, drift_m=0.0), corridor(seed, drift_m=0.3)
+    seen = np.r_[0:600, 1600:2400]
+    estimate = Trajectory(estimate.time_ns[seen], estimate.p[seen], estimate.q_wxyz[seen])
+    told = " // ".join(evaluate(estimate, truth).warnings)
+    assert "another convention" not in told and "are taken for qw" not in told and "conjugate" not in told

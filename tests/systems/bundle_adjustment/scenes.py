@@ -20,13 +20,15 @@ FOCAL, SIGMA = 500.0, 0.5
 FORMATS = ("bal", "gbp", "colmap")
 
 
-def reconstruction(seed: int, format: str = "gbp", *, cameras: int = 8, points: int = 150, share: float = 0.6) -> Reconstruction:
+def reconstruction(
+    seed: int, format: str = "gbp", *, cameras: int = 8, points: int = 150, share: float = 0.6, sigma: float = SIGMA
+) -> Reconstruction:
     """Cameras half around a cloud, each seeing a share of the points, perturbed."""
     rng = np.random.default_rng([seed, 1])
     T, p, camera_of, point_of = scene(seed, cameras, points)
     seen = rng.random(len(camera_of)) < share
     camera_of, point_of = camera_of[seen], point_of[seen]
-    return perturbed(rng, T, p, camera_of, point_of, format, 0.02, 0.05)
+    return perturbed(rng, T, p, camera_of, point_of, format, 0.02, 0.05, sigma)
 
 
 def turning(

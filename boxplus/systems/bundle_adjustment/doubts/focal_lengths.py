@@ -30,11 +30,13 @@ from boxplus.systems.bundle_adjustment.reconstruction_problem import add_reconst
 from boxplus.systems.bundle_adjustment.sightings import COLMAP_LAYOUT, Sightings, names_text
 
 _VAGUE = 0.03  # of a focal length, that its standard deviation may be: a held lens that is off by more bends a scene, too
-_UNKNOWN = 0.05  # the same of half of them, from which on nothing is to be trusted: one scene in twenty is off by a tenth
+_UNKNOWN = 0.1  # the same of half of them, from which on nothing is to be trusted: one scene in three is off by as much
 _LOOSE = 10.0  # [rad], and [1] of the distance of what is seen: standard deviation that holds a camera
 _FAR = 1e3  # of that distance: the same of a point
 _ANY = 100.0  # standard deviation of intrinsics that nothing tells; of a focal length, itself
 _LEAST_SCALE = 1e-6  # of the noise found, as a share of sigma: less is none
+_LEAST_HOLD = 1e-2  # the same for what is held: more loosely, rounding would decide
+_OPEN = 0.3  # of the deviation at which a focal length is held: as large a one is that of the hold
 _F = 6  # of a camera of BAL in its tangent: rotation, translation, f, k1, k2
 
 
@@ -46,11 +48,13 @@ class FocalLengths:
         names: (m,) cameras, as the file calls them.
         deviations: (m,) standard deviations, as shares of the focal lengths; about 1 where nothing tells.
         is_bal: of a BAL file.
+        problem: why they could not be computed; empty where they were.
     """
 
     names: NDArray[np.int64]
     deviations: NDArray[np.float64]
     is_bal: bool
+    problem: str = ""
 
     @property
     def is_grave(self) -> bool:
@@ -59,13 +63,15 @@ class FocalLengths:
 
     @property
     def sentence(self) -> str | None:
-        """Which are not known, the worst first; None where all are."""
+        """Which are not known, the worst first, or why nobody knows; None where all are."""
+        if self.problem:
+            return f"whether the images tell the focal lengths could not be computed ({self.problem})"
         vague = np.flatnonzero(self.deviations > _VAGUE)
         if not len(vague):
             return None
         vague = vague[np.argsort(-self.deviations[vague], kind="stable")]
         many = len(self.names)
-        worst, half = (f"{100.0 * share:.2g} %" for share in (self.deviations[vague[0]], np.median(self.deviations)))
+        worst, half = (f"{100.0 * min(share, 1.0):.3g} %" for share in (self.deviations[vague[0]], np.median(self.deviations)))
         known = f"up to {worst}" if len(vague) > 1 else worst
         known += f", and in half of all of {half} and more" if self.is_grave and many > 1 else ""
         hold = "hold those of calibrated cameras (" + (
@@ -110,15 +116,16 @@ def focal_lengths(
     if not (np.isfinite(distance) and distance > 0.0):
         return None
     scale = max(noise / config.sigma_px, _LEAST_SCALE)
+    loose = max(scale, _LEAST_HOLD)
     problem = Problem()
     cameras, points = add_reconstruction(problem, adjusted, used, config, loss)
     problem.fix(points[dropped])
     pose = np.tile([_LOOSE] * 3 + [_LOOSE * distance] * 3, (len(cameras), 1))
     if isinstance(adjusted, BalProblem):
         pose = np.hstack([pose, adjusted.cameras[:, 6:7], np.full((len(pose), 2), _ANY)])
-    _hold(problem, cameras, pose / scale)
-    _hold(problem, points, np.full((len(points), 3), _FAR * distance / scale))
-    lenses = [] if isinstance(adjusted, BalProblem) else _held_lenses(problem, adjusted, scale)
+    _hold(problem, cameras, pose / loose)
+    _hold(problem, points, np.full((len(points), 3), _FAR * distance / loose))
+    lenses = [] if isinstance(adjusted, BalProblem) else _held_lenses(problem, adjusted, loose)
     try:
         solution = problem.solve(config.solver.model_copy(update={"max_iterations": 0, "time_limit_s": None}))
         if isinstance(adjusted, BalProblem):
@@ -128,9 +135,11 @@ def focal_lengths(
         else:
             names = adjusted.camera_ids[[lens.number for lens in lenses]]
             shares = np.array([lens.share(solution) for lens in lenses])
-    except BoxplusError:  # no covariance, as where residuals cannot be evaluated
-        return None
-    return FocalLengths(names, scale * shares, isinstance(adjusted, BalProblem))
+    except BoxplusError as problem_met:  # no covariance, as where residuals cannot be evaluated
+        return FocalLengths(np.zeros(0, np.int64), np.zeros(0), isinstance(adjusted, BalProblem), str(problem_met))
+    # Exact data of a plane show no focal length, however small their errors: what is held is then known as well as it is held.
+    is_open = (shares > _OPEN / loose) & (scale < loose)
+    return FocalLengths(names, np.where(is_open, 1.0, scale * shares), isinstance(adjusted, BalProblem))
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,6 +70,33 @@ class CommonError:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """What an error is in the whitened errors `values` (k, d) of the edges `rows` (k,)."""
+
+    rows: NDArray[np.int64]
+    values: Floats
+
+
+class _Edges:
+    """Edges of a kind, and what the result has of them.
+
+    By the relative poses of the result, as those that were measured hold the very noise that they would be compared with; what
+    the result has of it is at right angles to the errors.
+    """
+
+    def __init__(self, known: Reliability, which: NDArray[np.bool_]) -> None:
+        self._known, self.rows = known, np.flatnonzero(which)
+        self.manifold, self.group = (SE3, se3) if known.graph.dimension == 3 else (SE2, se2)
+        i, j = known.graph.edges[self.rows].T
+        self.steps = np.asarray(self.group.compose(self.group.inverse(known.poses[i]), known.poses[j]))
+
+    def shape(self, moved: Callable[[float], Floats]) -> _Shape:
+        """How their whitened errors change with what moves their measurements."""
+        change = self.manifold.boxminus(self.steps, moved(_STEP)) - self.manifold.boxminus(self.steps, moved(-_STEP))
+        return _Shape(self.rows, np.einsum("nab,nb->na", self._known.factors[self.rows], change / (2.0 * _STEP)))
+
+
 def common_errors(known: Reliability, solution: Solution, odometry: NDArray[np.bool_]) -> list[CommonError]:
     """What the odometry may be off by in common, and after that loop closures, as far as it shows.
 
@@ -81,51 +108,45 @@ def common_errors(known: Reliability, solution: Solution, odometry: NDArray[np.b
     kinds = [list(_of_odometry(known, odometry))]
     if np.count_nonzero(~odometry) >= _LEAST:
         kinds.append(list(_of_loops(known, odometry)))
-    # Shapes are those of poses that are turned from the truth: of what the poses take up, as much is left over by that alone.
+    # Shapes are those of poses that are turned from the truth: of what the poses take up, as much is left over by that alone. In
+    # the middle of all poses, as one that hangs on a weak edge turns nothing but itself.
     turns = 3 if known.graph.dimension == 3 else 1
-    least = max(_SHOWN, float((known.deviations[:, :turns] ** 2).sum(axis=1).mean()))
+    least = max(_SHOWN, float(np.median((known.deviations[:, :turns] ** 2).sum(axis=1))))
     found = []
     for tried, (name, unit, b) in ((len(kind), shape) for kind in kinds for shape in kind):
         slopes = _scattered(known, b)
         (response,) = solution.response([slopes], is_determined=True)
-        length = float((b * b).sum())
+        length = float((b.values * b.values).sum())
         spare = length - float((slopes * response).sum())
         if not spare > least * length:
             continue
-        size = float((b * known.errors).sum()) / spare
+        size = float((b.values * known.errors[b.rows]).sum()) / spare
         with np.errstate(divide="ignore", invalid="ignore"):
             bent = np.abs(response * size) / known.deviations
         found.append(CommonError(name, unit, size, spare, float(np.nanmax(bent, initial=0.0)), tried))
     return found
 
 
-# By the relative poses of the result, as those that were measured hold the very noise that they would be compared with; what the
-# result has of it is at right angles to the errors.
-
-
-def _of_odometry(known: Reliability, odometry: NDArray[np.bool_]) -> Iterator[tuple[str, float, Floats]]:
-    """Name, factor to the unit it is told in, and shape (m, d) in the whitened errors."""
-    steps, shape = _relative(known, odometry), functools.partial(_shape, known, odometry)
-    dimension = known.graph.dimension
-    manifold = SE3 if dimension == 3 else SE2
+def _of_odometry(known: Reliability, odometry: NDArray[np.bool_]) -> Iterator[tuple[str, float, _Shape]]:
+    """Name, factor to the unit it is told in, and shape."""
+    edges, dimension = _Edges(known, odometry), known.graph.dimension
 
     def stretched(by: float) -> Floats:
-        moved: Floats = steps.copy()
+        moved: Floats = edges.steps.copy()
         moved[:, -dimension:] *= 1.0 + by
         return moved
 
-    yield "steps of the odometry are too long, in %,", 100.0, shape(stretched)
+    yield "steps of the odometry are too long, in %,", 100.0, edges.shape(stretched)
     for about, unit, one in _axes(dimension)[0]:
-        by_turn = functools.partial(lambda one, by: manifold.boxplus(steps, by * one), one)
-        yield f"steps of the odometry turn too far{about}, in degrees,", unit, shape(by_turn)
+        by_turn = functools.partial(lambda one, by: edges.manifold.boxplus(edges.steps, by * one), one)
+        yield f"steps of the odometry turn too far{about}, in degrees,", unit, edges.shape(by_turn)
 
 
-def _of_loops(known: Reliability, odometry: NDArray[np.bool_]) -> Iterator[tuple[str, float, Floats]]:
+def _of_loops(known: Reliability, odometry: NDArray[np.bool_]) -> Iterator[tuple[str, float, _Shape]]:
     """The same of loop closures."""
-    loops = ~odometry
-    steps, shape = _relative(known, loops), functools.partial(_shape, known, loops)
-    dimension, (i, j) = known.graph.dimension, known.graph.edges[loops].T
-    manifold, group = (SE3, se3) if dimension == 3 else (SE2, se2)
+    edges, dimension = _Edges(known, ~odometry), known.graph.dimension
+    steps, shape, manifold, group = edges.steps, edges.shape, edges.manifold, edges.group
+    i, j = known.graph.edges[edges.rows].T
     origin = np.eye(1, manifold.size)  # the identity of space; of the plane it is zero
     origin = origin if dimension == 3 else np.zeros_like(origin)
 
@@ -161,23 +182,6 @@ def _axes(dimension: int) -> tuple[list[tuple[str, float, Floats]], list[tuple[s
     return turns, shifts
 
 
-def _relative(known: Reliability, rows: NDArray[np.bool_]) -> Floats:
-    """What the result has of some edges."""
-    group = se3 if known.graph.dimension == 3 else se2
-    i, j = known.graph.edges[rows].T
-    return np.asarray(group.compose(group.inverse(known.poses[i]), known.poses[j]))
-
-
-def _shape(known: Reliability, rows: NDArray[np.bool_], moved: Callable[[float], Floats]) -> Floats:
-    """(m, d) how the whitened errors of some edges change with what moves their measurements; zero for the others."""
-    manifold = SE3 if known.graph.dimension == 3 else SE2
-    steps = _relative(known, rows)
-    b = np.zeros_like(known.errors)
-    change = manifold.boxminus(steps, moved(_STEP)) - manifold.boxminus(steps, moved(-_STEP))
-    b[rows] = np.einsum("nab,nb->na", known.factors[rows], change / (2.0 * _STEP))
-    return b
-
-
 def _motion(known: Reliability, odometry: NDArray[np.bool_]) -> Floats:
     """(n, d) step of the odometry from every pose to the next, or to it from the one before where there is no next."""
     manifold = SE3 if known.graph.dimension == 3 else SE2
@@ -192,9 +196,11 @@ def _motion(known: Reliability, odometry: NDArray[np.bool_]) -> Floats:
     return motion
 
 
-def _scattered(known: Reliability, b: Floats) -> Floats:
+def _scattered(known: Reliability, shape: _Shape) -> Floats:
     """Jᵀ b (n, d)."""
-    slopes = np.zeros((len(known.poses), b.shape[1]))
-    for rows, J in zip(known.graph.edges.T, known.jacobians, strict=True):
-        np.add.at(slopes, rows, np.einsum("nab,na->nb", J, b))
+    slopes = np.zeros((len(known.poses), shape.values.shape[1]))
+    for ends, J in zip(known.graph.edges[shape.rows].T, known.jacobians, strict=True):
+        pulled = np.einsum("nab,na->nb", J[shape.rows], shape.values)
+        for axis in range(slopes.shape[1]):
+            slopes[:, axis] += np.bincount(ends, pulled[:, axis], len(slopes))
     return slopes

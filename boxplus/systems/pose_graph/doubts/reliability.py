@@ -154,12 +154,14 @@ def suspicions(known: Reliability, solution: Solution, odometry: NDArray[np.bool
     best = max((one.squared for one in common), default=0.0)
     said = []
     if common and best >= squared[worst]:
-        # What odometry is off by, loop closures that are off the other way explain as well: it comes first.
-        alike = [one for one in common if one.squared > best - _ALIKE]
-        whole, scale = alike[0], noise(best, 1)
-        if whole.squared > scale * chi_square_exceeded(_STRANGE / whole.tried, 1):
+        # What odometry is off by, loop closures that are off the other way explain as well: it comes first. Any of those that
+        # are told by themselves may be what bends the result.
+        scale = noise(best, 1)
+        told = [one for one in common if one.squared > scale * chi_square_exceeded(_STRANGE / one.tried, 1)]
+        alike = [one for one in told if one.squared > best - _ALIKE]
+        if alike:
             other = f"; or {alike[1].name} by {alike[1].told(scale)}" if len(alike) > 1 else ""
-            said.append(Suspicion(whole.sentence(scale) + other, max(one.bent for one in alike) > BENT))
+            said.append(Suspicion(alike[0].sentence(scale) + other, max(one.bent for one in told) > BENT))
     else:
         scale = noise(float(squared[worst]), int(directions[worst]))
         limits = np.array([math.inf, *(chi_square_exceeded(_STRANGE / len(squared), k) for k in range(1, d + 1))])

@@ -94,3 +94,20 @@ def test_a_longer_way_is_told_of_the_odometry_first():
     measured[consecutive_edges(made.graph), 1:] *= 1.05
     told = optimize_pose_graph(replace(made.graph, measurements=measured)).doubt
     assert told is not None and "steps of the odometry are too long, in %, by" in told
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_pose_on_a_weak_edge_hides_nothing_of_it(dimension):
+    """Nothing turns with it but itself; with all poses averaged, it turned them all."""
+    graph = moved(walk(dimension, 3), "turn", 0.02)
+    last, d = int(graph.ids.max()), graph.measurements.shape[1] - (1 if dimension == 3 else 0)
+    hanging = replace(
+        graph,
+        ids=np.append(graph.ids, last + 1),
+        poses=None if graph.poses is None else np.concatenate([graph.poses, graph.poses[-1:]]),
+        edges=np.vstack([graph.edges, [[len(graph.ids) - 1, len(graph.ids)]]]),
+        measurements=np.concatenate([graph.measurements, graph.measurements[:1]]),
+        information=np.concatenate([graph.information, 1e-6 * np.eye(d)[None]]),
+    )
+    told = optimize_pose_graph(hanging)
+    assert re.search(NAMES["turn"][0], f"{told.doubt} {' '.join(told.notes)}")
