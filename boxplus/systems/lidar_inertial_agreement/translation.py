@@ -23,12 +23,11 @@ from boxplus.filtering.nav_state import STANDARD_GRAVITY
 from boxplus.manifolds import so3
 from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
 from boxplus.sensors.inertial.imu import ImuSamples
-from boxplus.systems.lidar_inertial_agreement.held_back import held_back
+from boxplus.systems.lidar_inertial_agreement.held_back import shifts_held_back
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 
 _FEWEST_POSES = 6  # of a stretch
 _SIGMA_M = 0.004  # of a pose by registration
-_HELD_M = 0.003  # the same, as far as it goes along with a small motion
 _LACKING_M = 0.1
 _ATTITUDE_RAD = 0.02
 _SHARED = 13
@@ -62,7 +61,7 @@ class TranslationFit:
         chi2: of it, per degree of freedom, before the covariance was scaled by it.
         explained: share of what the accelerometer could explain of the LiDAR's path that it does explain at this slope, 0 to 1.
         samples: positions compared.
-        signal_m: rms of what accelerations alone make of the positions, all other unknowns fitted: what the slope is read off.
+        excursion_m: rms of the LiDAR's positions about their mean.
         slope_reserve: added to the slope's variance where this stretch alone decides, as few groups of poses tell that variance
             coarsely; several stretches together tell it by what they differ by.
     """
@@ -78,7 +77,7 @@ class TranslationFit:
     chi2: float
     explained: float
     samples: int
-    signal_m: float
+    excursion_m: float
     slope_reserve: float = 0.0
 
     @property
@@ -93,7 +92,7 @@ class TranslationFit:
 
     @property
     def _held_back(self) -> float:
-        return held_back(_HELD_M**2, self.signal_m**2)
+        return shifts_held_back(self.excursion_m)
 
 
 class BodyAttitude:
@@ -176,8 +175,7 @@ def compare_accelerations(
         joint[:6, :6] = inflate * part.own + part.depends @ scaled @ part.depends.T
         begins.append(Stretch(int(stretch.time_ns[0]), part.alone - part.depends @ x, joint))
     # What is left grows by s² / var(s) when the slope is held at zero.
-    of_slope = 1.0 / np.linalg.inv(whole.measured + whole.known)[SLOPE, SLOPE]
-    without = x[SLOPE] ** 2 * of_slope
+    without = x[SLOPE] ** 2 / np.linalg.inv(whole.measured + whole.known)[SLOPE, SLOPE]
     explained = float(without / max(without + rest, 1e-12))
     return TranslationFit(
         x[GRAVITY],
@@ -191,7 +189,7 @@ def compare_accelerations(
         chi2,
         explained,
         samples,
-        _SIGMA_M * float(np.sqrt(of_slope / max(samples, 1))),
+        float(np.sqrt(((last.p_path_lidar - last.p_path_lidar.mean(axis=0)) ** 2).sum(axis=1).mean())),
         float((few_groups(groups) ** 2 - 1.0) * shared[SLOPE, SLOPE]),
     )
 

@@ -288,7 +288,7 @@ def test_a_few_poses_show_no_lengths() -> None:
     covariance = np.diag([1e-4] * 13)
     for samples, causes in ((10, []), (20, ["length_scale"])):
         fit = replace(agreement.translation, slope=2.15, covariance=covariance, sigma=0.004, explained=0.92)
-        fit = replace(fit, samples=samples, signal_m=0.1, slope_reserve=0.0)
+        fit = replace(fit, samples=samples, slope_reserve=0.0)
         doubtful = replace(agreement, translation=fit)
         assert [finding.cause for finding in contradictions(doubtful, simulation.T_imu_lidar)] == causes
         assert judges_lengths(doubtful) == bool(causes) and (slope_of(doubtful) is None) == (not causes)
@@ -299,7 +299,7 @@ def test_what_few_groups_of_poses_leave_unsure_counts_for_a_stretch_alone() -> N
     agreement = compare_sensors(*data(simulation), CONFIG, T_declared=simulation.T_imu_lidar)
     assert agreement.translation is not None
     fit = replace(agreement.translation, slope=0.87, covariance=np.diag([1e-3] * 13), sigma=0.004, explained=0.92, samples=40)
-    fit = replace(fit, signal_m=10.0)
+    fit = replace(fit, excursion_m=100.0)
     for reserve, causes in ((0.0, ["length_scale"]), (1.3e-3, [])):
         alone = replace(agreement, translation=replace(fit, slope_reserve=reserve))
         assert [finding.cause for finding in contradictions(alone, simulation.T_imu_lidar)] == causes

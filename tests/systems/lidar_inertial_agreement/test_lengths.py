@@ -51,11 +51,13 @@ def test_points_are_in_feet_where_only_feet_agree(slope: float, std: float, expl
     assert feet_finding(replace(fit, slope=-slope)) is None
 
 
-@pytest.mark.parametrize(("signal_m", "held_back"), [(0.003, 0.5), (0.006, 0.2), (0.01, 0.083), (0.1, 0.0009)])
-def test_of_a_signal_that_is_no_larger_than_the_error_of_a_pose_no_slope_is_known(signal_m: float, held_back: float) -> None:
+@pytest.mark.parametrize(("excursion_m", "held_back"), [(0.007, 0.67), (0.014, 0.34), (0.028, 0.113), (0.3, 0.0011)])
+def test_of_an_excursion_that_is_no_larger_than_the_error_of_a_pose_no_slope_is_known(
+    excursion_m: float, held_back: float
+) -> None:
     covariance = np.zeros((13, 13))
     covariance[SLOPE, SLOPE] = 0.02**2
     nothing = np.zeros(3)
-    fit = TranslationFit(nothing, nothing, nothing, 0.6, nothing, covariance, [], 1e-3, 1.0, 0.95, 40, signal_m, 0.03**2)
+    fit = TranslationFit(nothing, nothing, nothing, 0.6, nothing, covariance, [], 1e-3, 1.0, 0.95, 40, excursion_m, 0.03**2)
     assert fit.slope_std == pytest.approx(np.hypot(0.02, held_back), rel=0.02)
     assert fit.slope_std_alone == pytest.approx(np.sqrt(0.02**2 + 0.03**2 + held_back**2), rel=0.02)
