@@ -31,3 +31,8 @@ def turned_deg(trajectory: Trajectory) -> NDArray[np.float64]:
     """Turns (M,) from the mean orientation [degrees]."""
     R = trajectory.R
     return np.asarray(np.degrees(np.linalg.norm(so3.log(mean_rotation(R).T @ R), axis=1)))
+
+
+def in_one_world_deg(estimate: Trajectory, truth: Trajectory) -> float:
+    """Scatter of the orientations [deg], with the worlds laid over each other by these alone."""
+    return scatter_deg(world_turn(estimate, truth) @ estimate.R, truth.R)

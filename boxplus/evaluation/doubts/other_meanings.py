@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from boxplus.errors import InputError
 from boxplus.evaluation.alignment import Alignment, PositionAlignment, align
 from boxplus.evaluation.association import Association
-from boxplus.evaluation.doubts.mean_rotation import mean_rotation, scatter_deg, turned_deg, world_turn
+from boxplus.evaluation.doubts.mean_rotation import in_one_world_deg, mean_rotation, scatter_deg, turned_deg, world_turn
 from boxplus.evaluation.statistics import rms
 from boxplus.formats.trajectory import Trajectory
 from boxplus.manifolds import quaternion, so3
@@ -156,7 +156,7 @@ def _orientation_doubts(estimate: Trajectory, truth: Trajectory, alignment: Alig
             )
             return
     if _may_turn(alignment, rmse, scatter):
-        scatter = min(scatter, scatter_deg(world_turn(estimate, truth) @ estimate.R, truth.R))
+        scatter = min(scatter, in_one_world_deg(estimate, truth))
     if scatter < _FAR_DEG:
         return
     conjugates = {
@@ -201,7 +201,7 @@ def _w_first(estimate: Trajectory, truth: Trajectory, alignment: Alignment, scat
     }
     way = min(ways, key=lambda name: ways[name])
     if alignment.kind == "none" or _may_turn(alignment, rmse, scatter):  # worlds that are turned turn the bodies apart
-        scatter = min(scatter, scatter_deg(world_turn(estimate, truth) @ estimate.R, truth.R))
+        scatter = min(scatter, in_one_world_deg(estimate, truth))
     if not (scatter > _CONSTANT_DEG and ways[way] < _CLEARLY * scatter):
         return None
     return (

@@ -201,11 +201,11 @@ def adjust_bundle(
     )
     if lens is not None and not lens.is_grave:
         notes.append(lens.sentence)
-    lengths = focal_lengths(adjusted, sound.used, sound.cheirality.dropped, config, loss, errors, solution, left)
-    unknown = None if lengths is None or not depth.cameras_move_apart else lengths.sentence
-    is_unknown = unknown is not None and lengths is not None and lengths.is_grave
-    if unknown is not None and not is_unknown:
-        notes.append(unknown)
+    lengths = None
+    if depth.cameras_move_apart:
+        lengths = focal_lengths(adjusted, sound.used, sound.cheirality.dropped, config, loss, errors, solution, left)
+    if lengths is not None and lengths.sentence is not None and not lengths.is_grave:
+        notes.append(lengths.sentence)
     unconverged, late = unconverged_findings(solution, points, depth.undetermined, ids)
     notes += late
     said = [
@@ -217,7 +217,7 @@ def adjust_bundle(
         mirror_doubt(reconstruction.points[seen], adjusted.points[seen]),
         None if lens is None or not lens.is_grave else lens.sentence,
         origin.doubt,
-        unknown if is_unknown else None,
+        None if lengths is None or not lengths.is_grave else lengths.sentence,
     ]
     return BundleAdjustmentResult(
         reconstruction=adjusted,

@@ -14,6 +14,7 @@ factor beside: s the rms of positions or turns about their mean, n what a turn i
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from boxplus.manifolds import so3
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
@@ -30,7 +31,12 @@ def turns_held_back(path: LidarPath) -> float:
     """The same of the turns of a path about their mean, by what its registrations know of them."""
     turned = so3.log(path.R_path_lidar)
     known = np.linalg.pinv(path.information[1:, :3, :3], hermitian=True).trace(axis1=1, axis2=2) / 3.0
-    return _diluted(float(np.median(known)), float(((turned - turned.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    return _diluted(float(np.median(known)), rms_about_mean(turned) ** 2)
+
+
+def rms_about_mean(vectors: NDArray[np.float64]) -> float:
+    """Of vectors (N, 3)."""
+    return float(np.sqrt(((vectors - vectors.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def _diluted(error_squared: float, signal_squared: float) -> float:

@@ -23,7 +23,7 @@ from boxplus.filtering.nav_state import STANDARD_GRAVITY
 from boxplus.manifolds import so3
 from boxplus.sensors.inertial.gyro_attitude import GyroAttitude
 from boxplus.sensors.inertial.imu import ImuSamples
-from boxplus.systems.lidar_inertial_agreement.held_back import shifts_held_back
+from boxplus.systems.lidar_inertial_agreement.held_back import rms_about_mean, shifts_held_back
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 
 _FEWEST_POSES = 6  # of a stretch
@@ -83,16 +83,12 @@ class TranslationFit:
     @property
     def slope_std(self) -> float:
         """Of the noise, and of what registrations may hold back (`held_back`)."""
-        return float(np.hypot(np.sqrt(self.covariance[SLOPE, SLOPE]), self._held_back))
+        return float(np.hypot(np.sqrt(self.covariance[SLOPE, SLOPE]), shifts_held_back(self.excursion_m)))
 
     @property
     def slope_std_alone(self) -> float:
         """Where three of it are to hold for this stretch alone."""
-        return float(np.hypot(np.sqrt(self.covariance[SLOPE, SLOPE] + self.slope_reserve), self._held_back))
-
-    @property
-    def _held_back(self) -> float:
-        return shifts_held_back(self.excursion_m)
+        return float(np.hypot(self.slope_std, np.sqrt(self.slope_reserve)))
 
 
 class BodyAttitude:
@@ -189,7 +185,7 @@ def compare_accelerations(
         chi2,
         explained,
         samples,
-        float(np.sqrt(((last.p_path_lidar - last.p_path_lidar.mean(axis=0)) ** 2).sum(axis=1).mean())),
+        rms_about_mean(last.p_path_lidar),
         float((few_groups(groups) ** 2 - 1.0) * shared[SLOPE, SLOPE]),
     )
 

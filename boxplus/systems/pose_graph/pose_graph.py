@@ -45,7 +45,8 @@ from boxplus.systems.pose_graph.doubts.fit import (
 from boxplus.systems.pose_graph.doubts.fixed_poses import fixed_poses_doubt
 from boxplus.systems.pose_graph.doubts.information_readings import information_doubt, slack_part_notes
 from boxplus.systems.pose_graph.doubts.readings import misreading
-from boxplus.systems.pose_graph.doubts.reliability import Reliability, suspicions
+from boxplus.systems.pose_graph.doubts.reliability import Reliability
+from boxplus.systems.pose_graph.doubts.suspicions import suspicions
 from boxplus.systems.pose_graph.doubts.wide_rotations import are_wide, wide_notes
 from boxplus.systems.pose_graph.doubts.witnesses import held_against_each_other, lone_joints
 from boxplus.systems.pose_graph.loops import LoopVerdict, judge_loops

@@ -15,6 +15,8 @@ from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Fault, ImuModel, Scenario, Simulation, SpinningLidar
 from boxplus.simulation.faults import Event
 from boxplus.simulation.motions import manoeuvres
+from boxplus.simulation.motions.spline import SplineTrajectory
+from boxplus.simulation.motions.trajectories import START_NS, control_times
 from boxplus.simulation.scenarios import mounting
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath, Twist
@@ -35,6 +37,17 @@ def handheld(seed: int, seconds: float = 6.0, speed: float = 1.0, rate: float = 
     T = mounting(*random.uniform(-180.0, 180.0, 3), tuple(random.uniform(-0.2, 0.2, 3)))
     motion = manoeuvres.handheld(seconds, LOW, HIGH, speed, rate, standstill_s=0.0, seed=seed)
     return Simulation(Scenario("handheld", worlds.room(seed=seed), motion, lidar, ImuModel(), T), seed, seconds)
+
+
+def swaying(
+    seed: int, p_mean: tuple[float, float, float], shift_m: float, turn_rad: float, seconds: float = 4.5
+) -> SplineTrajectory:
+    """Along some direction and about some axis, once a second, as a hand that holds still does."""
+    random, time_s = np.random.default_rng(seed), control_times(seconds, 0.05)
+    along, about = (v / np.linalg.norm(v) for v in random.normal(size=(2, 3)))
+    swing = [np.sin(2.0 * np.pi * time_s + phase)[:, None] for phase in random.uniform(0.0, 2.0 * np.pi, 2)]
+    p = np.array(p_mean) + shift_m * swing[0] * along
+    return SplineTrajectory(START_NS, 0.05, so3.exp(turn_rad * swing[1] * about), p)
 
 
 def data(simulation: Simulation, fault: Fault | None = None) -> Data:

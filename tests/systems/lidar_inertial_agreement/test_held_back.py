@@ -5,15 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from boxplus.manifolds import so3
 from boxplus.simulation import ImuModel, RosetteLidar, Scenario, Simulation, SpinningLidar
-from boxplus.simulation.motions.spline import SplineTrajectory
-from boxplus.simulation.motions.trajectories import START_NS, control_times
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_agreement.agreement import Agreement, compare_sensors
 from boxplus.systems.lidar_inertial_agreement.held_back import shifts_held_back, turns_held_back
 from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions
-from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld
+from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data, handheld, swaying
 
 RINGS = SpinningLidar(channels=32, azimuth_steps=450, vertical_fov_deg=(-30.0, 30.0))
 ROSETTE = RosetteLidar(points_per_scan=3000)
@@ -21,11 +18,7 @@ ROSETTE = RosetteLidar(points_per_scan=3000)
 
 def _swaying(shift_m: float, turn_rad: float, lidar: RosetteLidar | SpinningLidar, seed: int) -> Agreement:
     """Once a second, in a room of 5 by 4 m."""
-    time_s, random = control_times(4.5, 0.05), np.random.default_rng(seed)
-    along, about = (v / np.linalg.norm(v) for v in random.normal(size=(2, 3)))
-    swing = [np.sin(2.0 * np.pi * time_s + phase)[:, None] for phase in random.uniform(0.0, 2.0 * np.pi, 2)]
-    p = np.array([-1.0, 0.5, 1.2]) + shift_m * swing[0] * along
-    motion = SplineTrajectory(START_NS, 0.05, so3.exp(turn_rad * swing[1] * about), p)
+    motion = swaying(seed, (-1.0, 0.5, 1.2), shift_m, turn_rad)
     room = worlds.room((5.0, 4.0, 3.0), seed=seed)
     scans, imu = data(Simulation(Scenario("sways", room, motion, lidar, ImuModel(), T_imu_lidar=np.eye(4)), seed, 4.0))
     return compare_sensors(scans, imu, CONFIG, T_declared=np.eye(4))

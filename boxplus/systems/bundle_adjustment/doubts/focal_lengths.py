@@ -156,14 +156,14 @@ class _Lens:
         return float((np.sqrt(np.diag(C)[: self.count]) / self.block.values[0, : self.count]).max())
 
 
-def _held_lenses(problem: Problem, model: ColmapModel, scale: float) -> list[_Lens]:
+def _held_lenses(problem: Problem, model: ColmapModel, loose: float) -> list[_Lens]:
     """Lenses that are refined, held loosely."""
     lenses = []
     for number, block in lens_blocks(model, problem).items():
         count = len(set(COLMAP_LAYOUT[model.camera_models[number]][:2]))
         sigma = np.full((1, block.manifold.dof), _ANY)
         sigma[0, :count] = block.values[0, :count]
-        _hold(problem, block, sigma / scale)
+        _hold(problem, block, sigma / loose)
         lenses.append(_Lens(number, block, count))
     return lenses
 

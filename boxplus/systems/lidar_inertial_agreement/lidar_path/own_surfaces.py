@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from boxplus.filtering.nav_state import NavState
-from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.sensors.lidar.scan import Scan
+from boxplus.systems.lidar_inertial_agreement.lidar_path.shifted_scans import unmoved_map
 from boxplus.systems.lidar_inertial_agreement.lidar_path.tracks.scan_fit import MOST_MAP_POINTS, MOST_POINTS
 
 _LITTLE = 0.1
@@ -28,8 +28,7 @@ def share_on_own_surfaces(scan: Scan, config: RegistrationConfig) -> float:
     Args:
         scan: as it was measured. config: with the cells that suit it (`registration.with_cells_for`).
     """
-    tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
-    tree.insert(VoxelFilter(config.map_cell, MOST_MAP_POINTS)(scan.p_lidar)[1].astype(np.float64), downsample=True)
+    tree = unmoved_map([scan], VoxelFilter(config.map_cell, MOST_MAP_POINTS), config)
     points = VoxelFilter(max(config.scan_voxel, config.map_cell), MOST_POINTS)(scan.p_lidar)[0]
     measurement = PlaneMeasurement(points, tree, config, with_extrinsic=False)
     return measurement.at(NavState.identity().pack(), rematch=True).used / max(len(points), 1)

@@ -13,7 +13,6 @@ import functools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +21,8 @@ from boxplus.manifolds import se2, se3
 from boxplus.manifolds.se2 import SE2
 from boxplus.manifolds.se3 import SE3
 from boxplus.optimization.solution import Solution
+from boxplus.systems.pose_graph.doubts.reliability import Floats, Reliability
 from boxplus.systems.pose_graph.problem import odometry_order
-
-if TYPE_CHECKING:
-    from boxplus.systems.pose_graph.doubts.reliability import Reliability
-
-Floats = NDArray[np.float64]
 
 _LEAST = 10  # edges of a kind, for an error of its own
 _SHOWN = 1e-3  # share of a common error that shows, below which the curvature of noisy poses shows as much of one

@@ -18,7 +18,8 @@ from boxplus.optimization.solver_options import SolverOptions
 from boxplus.sparse.graphs.components import connected_components
 from boxplus.sparse.graphs.cut_edges import cut_edges
 from boxplus.systems.pose_graph.doubts.fit import Fit, edge_names, misfit, standing_out
-from boxplus.systems.pose_graph.doubts.reliability import BENT, Reliability, Suspicion, suspicions
+from boxplus.systems.pose_graph.doubts.reliability import Reliability
+from boxplus.systems.pose_graph.doubts.suspicions import BENT, Suspicion, suspicions
 from boxplus.systems.pose_graph.problem import (
     consecutive_edges,
     manifold_of,

@@ -25,6 +25,7 @@ from tests.systems.lidar_inertial_agreement.small_platforms import CONFIG, data,
 
 COLUMNS = SpinningLidar(channels=64, azimuth_steps=62, vertical_fov_deg=(-45.0, 45.0))
 """Its columns lie six degrees apart: at ten metres a metre, along a column a sixth of that."""
+RINGS = SpinningLidar(channels=32, azimuth_steps=600, vertical_fov_deg=(-25.0, 15.0))
 
 
 @lru_cache(maxsize=1)
@@ -81,8 +82,7 @@ def driving(place: str) -> tuple[Simulation, list[Scan]]:
     """Along a street at 15 m/s, or through a wood at a walk."""
     world, speed = {"street": (sites.street(seed=1), 15.0), "wood": (sites.forest(seed=2), 1.5)}[place]
     motion = manoeuvres.constant_velocity(3.5, (-20.0, 0.0, 1.8), (speed, 0.0, 0.0), np.eye(3))
-    lidar = SpinningLidar(channels=32, azimuth_steps=600, vertical_fov_deg=(-25.0, 15.0))
-    simulation = Simulation(Scenario(place, world, motion, lidar, ImuModel()), 1, 3.0)
+    simulation = Simulation(Scenario(place, world, motion, RINGS, ImuModel()), 1, 3.0)
     return simulation, data(simulation)[0]
 
 
@@ -110,8 +110,7 @@ def test_a_path_in_motion_does_however_much_comes_newly_into_view(place: str, fa
 )
 def test_rain_at_rest_excuses_no_estimate_that_runs_away(place: World) -> None:
     random, rest = np.random.default_rng(0), trajectories.at_rest(4.5, (0.0, 0.0, 1.8))
-    lidar = SpinningLidar(channels=32, azimuth_steps=600, vertical_fov_deg=(-25.0, 15.0))
-    simulation = Simulation(Scenario("rain", place, rest, lidar, ImuModel()), 1, 4.0)
+    simulation = Simulation(Scenario("rain", place, rest, RINGS, ImuModel()), 1, 4.0)
     scans = data(simulation)[0]
     path = true_path(simulation, scans)
     for scan in scans:

@@ -7,14 +7,13 @@ import pytest
 
 from boxplus.evaluation.nees import nees, nees_band
 from boxplus.filtering.nav_state import T_BA, T_BW, T_G, T_V
-from boxplus.manifolds import so3
 from boxplus.simulation import ImuModel, Scenario, Simulation
 from boxplus.simulation.motions import manoeuvres, trajectories
-from boxplus.simulation.motions.spline import SplineTrajectory, Trajectory
-from boxplus.simulation.motions.trajectories import START_NS, control_times
+from boxplus.simulation.motions.spline import Trajectory
 from boxplus.simulation.worlds import worlds
 from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
 from boxplus.systems.lidar_inertial_odometry.start.start import Start, find_start
+from tests.systems.lidar_inertial_agreement.small_platforms import swaying
 from tests.systems.lidar_inertial_odometry.small_drives import LIDAR, config, deviations, frames, position_errors, run
 
 ROOM = (24.0, 20.0, 5.0)
@@ -43,20 +42,11 @@ def started(motion: Trajectory, seed: int, imu: ImuModel) -> tuple[Start, np.nda
     return found, error, found.covariance[np.ix_(of, of)]
 
 
-def _swaying(seed: int) -> Trajectory:
-    """By 1 cm and 0.6 deg once a second, as who stands and holds a sensor."""
-    random, time_s = np.random.default_rng(seed), control_times(3.0, 0.05)
-    along, about = (v / np.linalg.norm(v) for v in random.normal(size=(2, 3)))
-    swing = [np.sin(2.0 * np.pi * time_s + phase)[:, None] for phase in random.uniform(0.0, 2.0 * np.pi, 2)]
-    p = np.array([-5.0, -2.0, 1.5]) + 0.01 * swing[0] * along
-    return SplineTrajectory(START_NS, 0.05, so3.exp(0.01 * swing[1] * about), p)
-
-
 def test_a_platform_that_sways_at_rest_is_as_fast_and_turns_as_it_says() -> None:
     """Somewhere in its swing it moves with up to 6 cm/s, and its mean turn rate is no bias."""
     deviations_of = []
     for seed in range(6):
-        found, error, P = started(_swaying(seed), seed, ImuModel())
+        found, error, P = started(swaying(seed, (-5.0, -2.0, 1.5), 0.01, 0.01, 3.0), seed, ImuModel())
         assert found.kind == "static"
         deviations_of.append(error / np.sqrt(P.diagonal()))
     velocity, bias = np.array(deviations_of)[:, :3], np.array(deviations_of)[:, 9:]
