@@ -7,6 +7,7 @@
     python benchmarks/campaign.py --bag --seeds 0:20          # real bags through the real command line
     python benchmarks/campaign.py --real 20                   # real IMU and motion (needs the shared folder)
     python benchmarks/campaign.py --fast --seeds 0:40         # on roads, at up to 33 m/s
+    python benchmarks/campaign.py --still --seeds 0:40        # platforms that hardly move: sway, hover, creep, pan
     python benchmarks/campaign.py --odd --seeds 0:40          # LiDARs, mountings and rates on which nothing has been chosen
     python benchmarks/campaign.py --rough --seeds 0:40        # with what real recordings have besides: rain, people, lost packets
     python benchmarks/campaign.py --merge a.jsonl b.jsonl     # tables of earlier runs, nothing is run; takes --only as well
@@ -39,6 +40,11 @@ from lio_campaign.report import against, describe, report
 from lio_campaign.run import run_real, run_seed
 
 _SMALL, _NIGHTLY = 40, 1000
+_VARIETIES = {
+    "fast": "on roads, at up to 33 m/s",
+    "still": "platforms that sway, hover, creep, float, pan, or stop again and again",
+    "odd": "with other LiDARs, mountings and rates of the IMU",
+}
 _SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
 
@@ -86,9 +92,9 @@ def _work(options: argparse.Namespace) -> tuple[Run, list[int]] | str:
     """What to do with which seeds, or why nothing can be done."""
     begin, end = options.seeds
     if options.real is None:
-        kinds = functools.partial(draw_kinds, fast=options.fast, odd=options.odd)
+        kinds = functools.partial(draw_kinds, variety=options.variety)
         seeds = [seed for seed in range(begin, end) if kinds(seed).matches(dict(options.only))]
-        how = {"command_line": options.bag, "rough": options.rough, "fast": options.fast, "odd": options.odd}
+        how = {"command_line": options.bag, "rough": options.rough, "variety": options.variety}
         return functools.partial(run_seed, **how), seeds
     missing = why_not(options.shared)
     if missing is not None:
@@ -108,10 +114,10 @@ def _runs(run: Run, seeds: Sequence[int], options: argparse.Namespace) -> Iterat
 def _crashed(seed: int, problem: BaseException, options: argparse.Namespace) -> dict[str, Any]:
     """The line of a run that ended in an exception nobody raised on purpose: a user would see a traceback."""
     seen, real = "".join(traceback.format_exception(problem)), options.real is not None
-    kinds = asdict(draw_kinds(seed, fast=options.fast, odd=options.odd))
+    kinds = asdict(draw_kinds(seed, options.variety))
     if real:  # drawn with its recording, which may be what is missing
         kinds = dict.fromkeys(kinds, "unknown")
-    how = {"real": real, "rough": options.rough, "fast": options.fast, "odd": options.odd}
+    how = {"real": real, "rough": options.rough, "variety": options.variety}
     facts = {"seed": seed, **how, **kinds, "detail": type(problem).__name__}
     verdict = {"verdict": "crashed", "reasons": ["no estimate"], "flags": [seen], "false_alarm": ""}
     return facts | verdict | {"worst_m": None, "falsely_weak_scans": [], "exit_code": 1, "cpu_s": 0.0}
@@ -126,16 +132,18 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--bag", action="store_true", help="write bags and run the real command line")
     parser.add_argument("--real", type=int, metavar="N", help="N recordings with a real IMU and motion, from the first seed on")
     parser.add_argument("--rough", action="store_true", help="with rain, people, lost packets and the like")
-    parser.add_argument("--fast", action="store_true", help="on roads, at up to 33 m/s; not with --real")
-    parser.add_argument("--odd", action="store_true", help="with other LiDARs, mountings and rates of the IMU; not with --real")
+    variety = parser.add_mutually_exclusive_group()
+    for name, what in _VARIETIES.items():
+        variety.add_argument(f"--{name}", dest="variety", action="store_const", const=name, help=f"{what}; not with --real")
+    parser.set_defaults(variety="usual")
     parser.add_argument("--against", type=Path, metavar="FILE", help="earlier lines of the same seeds: what ended otherwise")
     parser.add_argument("--shared", type=Path, default=_SHARED, help="folder with tools/make_lio_recording.py and data/imu")
     parser.add_argument("--out", type=Path, help="append one JSON line a run")
     parser.add_argument("--merge", type=Path, nargs="+", help="only tables, of these JSON lines")
     parser.add_argument("-v", "--verbose", action="store_true", help="all that is known about every run")
     options = parser.parse_args(arguments)
-    if (options.fast or options.odd) and options.real is not None:
-        parser.error("--fast makes roads of its own, and --odd LiDARs: without --real")
+    if options.variety != "usual" and options.real is not None:
+        parser.error(f"--{options.variety} makes recordings of its own: without --real")
     options.seeds = options.seeds or (0, _NIGHTLY if options.nightly else _SMALL)
     return options
 

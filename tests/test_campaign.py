@@ -250,8 +250,8 @@ def test_nuisances_follow_from_their_seed_and_leave_the_rest_alone(campaign: Sim
 
 def test_traffic_stands_in_the_way_of_rays_the_same_every_time(campaign: SimpleNamespace) -> None:
     wanted = {"fault": "none", "world": "highway", "motion": "fast_constant", "sensor": "spinning16"}
-    seed = next(seed for seed in range(2000) if campaign.draws.draw_kinds(seed, fast=True).matches(wanted))
-    simulation = replace(campaign.draws.draw(seed, fast=True), duration_s=1.0).truth()
+    seed = next(seed for seed in range(2000) if campaign.draws.draw_kinds(seed, "fast").matches(wanted))
+    simulation = replace(campaign.draws.draw(seed, "fast"), duration_s=1.0).truth()
     lidar = simulation.scenario.lidar
     scene = campaign.nuisances.Scene(simulation, simulation.T_imu_lidar, lidar.channels, lidar.vertical_fov_deg)
     plain = [event for event in simulation.events() if isinstance(event, Scan)]

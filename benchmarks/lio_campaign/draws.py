@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,8 +15,8 @@ from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import Fault, RosetteLidar, Scenario, Simulation, SpinningLidar, faults, mounting
 from boxplus.simulation.lidar import LidarModel
 from boxplus.simulation.motions import manoeuvres
-from lio_campaign import places, roads, unusual
-from lio_campaign.places import Place, make_motion
+from lio_campaign import hardly_moving, places, roads, unusual
+from lio_campaign.places import DrawMotion, Place, make_motion
 from lio_campaign.spoil import FAULT_KINDS, MOUNTING_FAULTS, READER_FAULTS, Setting, deliver, draw_spoiling
 
 SENSORS = ("spinning16", "spinning32", "spinning64", "spinning128", "rosette")
@@ -27,6 +28,7 @@ _ROSETTE_POINTS_S = 200_000.0
 FAULTY_SHARE = 0.5
 _BAG_SHARE = 0.25
 _IMU_RATES_HZ = (100.0, 125.0, 200.0, 250.0, 400.0)
+_SHAKEN = ("vibration", "hover")  # by motors
 
 
 @dataclass(frozen=True)
@@ -96,13 +98,13 @@ class _CastOnce(Simulation):
         return self._scans[index]
 
 
-def draw_kinds(seed: int, *, fast: bool = False, odd: bool = False) -> Kinds:
-    """The kinds of a seed; `fast` takes it on a road, at up to 33 m/s, `odd` gives it sensors of unusual.py."""
+def draw_kinds(seed: int, variety: str = "usual") -> Kinds:
+    """The kinds of a seed, of one of `VARIETIES`."""
+    of = VARIETIES[variety]
     random = np.random.Generator(np.random.PCG64([seed, 1]))
-    motions = roads.MOTIONS if fast else places.MOTIONS
-    motion = str(random.choice(list(motions)))
-    world = str(random.choice(motions[motion]))
-    sensor = str(random.choice(unusual.SENSORS if odd else SENSORS))
+    motion = str(random.choice(list(of.motions)))
+    world = str(random.choice(of.motions[motion]))
+    sensor = str(random.choice(of.sensors))
     imu = str(random.choice(list(IMU_GRADES)))
     extrinsic = str(random.choice(EXTRINSICS, p=(0.4, 0.4, 0.2)))
     fault = str(random.choice(FAULT_KINDS)) if random.uniform() < FAULTY_SHARE else "none"
@@ -113,19 +115,19 @@ def draw_kinds(seed: int, *, fast: bool = False, odd: bool = False) -> Kinds:
     return Kinds(world, motion, sensor, imu, extrinsic, fault, str(bag).lower())
 
 
-def draw(seed: int, *, fast: bool = False, odd: bool = False) -> Draw:
-    """Everything about a seed; `fast` takes it on a road, at up to 33 m/s, `odd` gives it sensors of unusual.py."""
-    kinds = draw_kinds(seed, fast=fast, odd=odd)
+def draw(seed: int, variety: str = "usual") -> Draw:
+    """Everything about a seed, of one of `VARIETIES`."""
+    of, kinds = VARIETIES[variety], draw_kinds(seed, variety)
     random = np.random.Generator(np.random.PCG64([seed, 2]))
-    place = (roads.PLACES if fast else places.PLACES)[kinds.world](random)
-    lidar, duration_s = (unusual.lidar if odd else _lidar)(kinds.sensor, random)
-    trajectory = (roads.fast_motion if fast else make_motion)(kinds.motion, kinds.world, place, duration_s, random)
+    place = of.places[kinds.world](random)
+    lidar, duration_s = of.lidar(kinds.sensor, random)
+    trajectory = make_motion(of.motion, kinds.motion, kinds.world, place, duration_s, random)
     duration_s = min(duration_s, trajectory.duration_s)
-    imu = draw_imu(kinds.imu, unusual.IMU_RATES_HZ if odd else _IMU_RATES_HZ, random)
-    if kinds.motion == "vibration":
+    imu = draw_imu(kinds.imu, of.imu_rates_hz, random)
+    if kinds.motion in _SHAKEN:
         strength, hz = random.uniform(0.7, 1.3), random.uniform(55.0, 90.0)
         imu = imu.model_copy(update={"accel_vibration": strength, "gyro_vibration": 0.02 * strength, "vibration_hz": hz})
-    T_imu_lidar = (unusual.any_mounting if odd else _mounting)(kinds.extrinsic == "absent", random)
+    T_imu_lidar = of.mounting(kinds.extrinsic == "absent", random)
     scenario = Scenario(f"campaign {seed}", place.world, trajectory, lidar, imu, T_imu_lidar)
     bag, file_format = kinds.bag == "true", str(random.choice(("ros2", "ros1")))
     begin_s = float(random.uniform(4.0, 0.6 * duration_s))
@@ -184,3 +186,41 @@ def _mounting(near: bool, random: np.random.Generator) -> NDArray[np.float64]:
     yaw = random.uniform(-180.0, 180.0) if random.uniform() < 0.7 else random.uniform(-10.0, 10.0)
     roll, pitch = random.uniform(-8.0, 8.0, 2)
     return mounting(roll, pitch, yaw, tuple(random.uniform(-reach, reach, 3)))
+
+
+@dataclass(frozen=True)
+class Variety:
+    """What one kind of campaign draws from.
+
+    Attributes:
+        motions: the worlds that suit each motion.
+        places: of the worlds.
+        motion: draws one, which may be longer than asked for.
+        sensors, lidar: names, and what draws one, with the length of its recording [s].
+        imu_rates_hz: of the IMU.
+        mounting: draws T_imu_lidar (4, 4), near the IMU or anywhere.
+    """
+
+    motions: Mapping[str, tuple[str, ...]]
+    places: Mapping[str, Callable[[np.random.Generator], Place]]
+    motion: DrawMotion
+    sensors: tuple[str, ...] = SENSORS
+    lidar: Callable[[str, np.random.Generator], tuple[LidarModel, float]] = _lidar
+    imu_rates_hz: tuple[float, ...] = _IMU_RATES_HZ
+    mounting: Callable[[bool, np.random.Generator], NDArray[np.float64]] = _mounting
+
+
+_USUAL = Variety(places.MOTIONS, places.PLACES, places.usual_motion)
+VARIETIES = {
+    "usual": _USUAL,
+    "fast": Variety(roads.MOTIONS, roads.PLACES, roads.fast_motion),
+    "still": Variety(hardly_moving.MOTIONS, places.PLACES, hardly_moving.hardly_moving),
+    "odd": replace(
+        _USUAL,
+        sensors=unusual.SENSORS,
+        lidar=unusual.lidar,
+        imu_rates_hz=unusual.IMU_RATES_HZ,
+        mounting=unusual.any_mounting,
+    ),
+}
+"""What a campaign varies: the usual, on roads at up to 33 m/s, platforms that hardly move, and sensors of unusual.py."""

@@ -103,14 +103,20 @@ MOTIONS: dict[str, tuple[str, ...]] = {
 """The worlds that suit each motion."""
 
 
-def make_motion(motion: str, world: str, place: Place, duration_s: float, random: np.random.Generator) -> Trajectory:
+DrawMotion = Callable[[str, str, Place, float, np.random.Generator], Trajectory]
+"""Draws a motion of a kind in a world, at its place, for so many seconds or longer."""
+
+
+def make_motion(
+    draw: DrawMotion, motion: str, world: str, place: Place, duration_s: float, random: np.random.Generator
+) -> Trajectory:
     """A motion in free space, drawn again until it keeps its distance from every surface; it may be longer than asked for.
 
     Raises:
         RuntimeError: none was found, the box of the place is not free.
     """
     for _ in range(_TRIES):
-        trajectory = _draw(motion, world, place, duration_s, random)
+        trajectory = draw(motion, world, place, duration_s, random)
         instants = np.arange(trajectory.start_ns, trajectory.start_ns + round(duration_s * 1e9), 20_000_000)
         path = trajectory.evaluate(instants[instants <= trajectory.end_ns]).p_world_imu
         if place.world.distance(path).min() > CLEARANCE_M:
@@ -118,7 +124,8 @@ def make_motion(motion: str, world: str, place: Place, duration_s: float, random
     raise RuntimeError(f"no free course for {motion} in {world}")
 
 
-def _draw(motion: str, world: str, place: Place, duration_s: float, random: np.random.Generator) -> Trajectory:
+def usual_motion(motion: str, world: str, place: Place, duration_s: float, random: np.random.Generator) -> Trajectory:
+    """A motion of `MOTIONS`."""
     seed = int(random.integers(1 << 30))
     rest = float(random.uniform(1.5, 3.0))
     if motion == "rest_then_walk":

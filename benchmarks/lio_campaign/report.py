@@ -45,7 +45,7 @@ def against(lines: Sequence[Line], before: Sequence[Line]) -> str:
 
 
 def _recording(line: Line) -> tuple[Any, ...]:
-    return tuple(line[key] for key in ("seed", "real", "rough", "fast", "odd", "bag"))
+    return tuple(line[key] for key in ("seed", "real", "rough", "variety", "bag"))
 
 
 def _summary(lines: Sequence[Line]) -> str:
@@ -130,7 +130,8 @@ def _cases(lines: Sequence[Line], verdict: str, name: str) -> str:
 def command(line: Line) -> str:
     """What repeats a run."""
     how = " --real 1" if line["real"] else " --bag" if line["bag"] == "command" else ""
-    how += "".join(f" --{kind}" for kind in ("fast", "rough", "odd") if line[kind])
+    how += " --rough" if line["rough"] else ""
+    how += "" if line["variety"] == "usual" else f" --{line['variety']}"
     return f"python benchmarks/campaign.py --seeds {line['seed']}:{line['seed'] + 1} -v{how}"
 
 

@@ -44,27 +44,24 @@ _POINTS_LOOKED_AT = 500
 _COMMAND = (sys.executable, "-c", "from boxplus.cli import main; main()", "lio")
 
 
-def run_seed(
-    seed: int, *, command_line: bool = False, rough: bool = False, fast: bool = False, odd: bool = False
-) -> dict[str, Any]:
+def run_seed(seed: int, *, command_line: bool = False, rough: bool = False, variety: str = "usual") -> dict[str, Any]:
     """Everything about one seed, as a line of JSON.
 
     Args:
         seed: which.
         command_line: write a bag and run the real `boxplus lio` in a process of its own.
         rough: with what real recordings have besides, see nuisances.py.
-        fast: on a road, see roads.py.
-        odd: with sensors and mountings on which nothing has been chosen, see unusual.py.
+        variety: of `VARIETIES`.
     """
     clock = _Clock()
-    made = draw(seed, fast=fast, odd=odd)
+    made = draw(seed, variety)
     simulation = made.truth()
     lidar = simulation.scenario.lidar
     elevation = getattr(lidar, "vertical_fov_deg", (0.0, 0.0))
     scene = Scene(simulation, simulation.T_imu_lidar, getattr(lidar, "channels", 1), elevation)
     if rough:
         made = _roughened(made, *draw_nuisances(scene, seed))
-    if fast and seed % 4 >= 2:  # on every other pair of roads, so that tuned and untouched seeds have both
+    if variety == "fast" and seed % 4 >= 2:  # on every other pair of roads, so that tuned and untouched seeds have both
         made = _roughened(made, traffic(scene, seed), "traffic")
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
@@ -75,7 +72,7 @@ def run_seed(
     suspects: list[dict[str, float]] = []
     if _looked_at(made) and outcome.estimate is not None:
         suspects = falsely_weak(outcome.estimate, simulation)
-    facts = {"seed": seed, "real": False, "rough": rough, "fast": fast, "odd": odd, **_drawn(made)}
+    facts = {"seed": seed, "real": False, "rough": rough, "variety": variety, **_drawn(made)}
     if command_line:
         facts["bag"] = "command"
     return facts | _judged(made, outcome, simulation, suspects) | clock.read()
@@ -98,7 +95,7 @@ def run_real(seed: int, shared: Path, *, rough: bool = False) -> dict[str, Any]:
             made = _roughened(made, *draw_nuisances(scene, seed))
         outcome = _in_process(lambda options: opened_real(made, options), made, work)
         truth = made.truth()
-    facts = {"seed": seed, "real": True, "rough": rough, "fast": False, "odd": False, **_drawn(made)}
+    facts = {"seed": seed, "real": True, "rough": rough, "variety": "usual", **_drawn(made)}
     return facts | _judged(made, outcome, truth, []) | clock.read()
 
 
