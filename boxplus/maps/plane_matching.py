@@ -81,8 +81,13 @@ def match_planes(
         y = ray[0] + p_map_lidar[0], ray[1] + p_map_lidar[1], ray[2] + p_map_lidar[2]
         near = neighbours[n]
         qx, qy, qz = np.float32(y[0]), np.float32(y[1]), np.float32(y[2])  # far from the origin, rounding exceeds the slack
-        seen = reach[n]
-        asked = warm and seen[3] > 0.0  # on a line before, it will be on one again: one search for fifteen finds five as well
+        # What was near at an earlier call, or near the point before, which is close by, tells what to ask for and bounds it.
+        known = n if warm else n - 1
+        has_known = warm or n > begin
+        seen = reach[known] if has_known else reach[n]
+        asked = (
+            has_known and seen[3] > 0.0
+        )  # on a line before, it will be on one again: one search for fifteen finds five as well
         found = np.int64(0)
         if asked:
             moved = math.sqrt((seen[0] - qx) ** 2 + (seen[1] - qy) ** 2 + (seen[2] - qz) ** 2)
@@ -93,16 +98,15 @@ def match_planes(
             for i in range(count):
                 near[i] = many[i]
         else:
-            # Five points of the map bound the search: those of an earlier call, or those of the point before, which is near by.
-            known = n if warm else n - 1
             bound = max_distance_sq
-            if (warm or n > begin) and fate[known] != FEW_NEIGHBOURS:
+            if has_known and fate[known] != FEW_NEIGHBOURS:
                 farthest = 0.0
                 for i in range(NEIGHBOURS):
                     dx, dy, dz = neighbours[known, i, 0] - qx, neighbours[known, i, 1] - qy, neighbours[known, i, 2] - qz
                     farthest = max(farthest, np.float64(dx * dx + dy * dy + dz * dz))
                 bound = min(bound, farthest * _SLACK)
             count = knn5(view, qx, qy, qz, np.float32(bound), near, found_sq, stack)
+        seen = reach[n]
         seen[3] = 0.0
         if count < NEIGHBOURS:
             fate[n] = FEW_NEIGHBOURS

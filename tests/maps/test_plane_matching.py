@@ -226,6 +226,24 @@ def test_a_warm_search_finds_what_a_cold_one_finds(seed: int, moved: float, of_r
     np.testing.assert_array_equal(warm.reach[:, 3], cold.reach[:, 3])
 
 
+@settings(max_examples=10)
+@given(seeds, st.sampled_from([1, 2, 7]))
+def test_what_the_point_before_needed_decides_nothing(seed: int, run: int) -> None:
+    """Points on rings, which need fifteen neighbours, and points of a dense floor, which do not, in runs of some of each."""
+    random = np.random.default_rng(seed)
+    wall, on_rings = _rings(seed)
+    floor = np.stack([random.uniform(4.0, 9.0, 800), random.uniform(-3.0, 3.0, 800), random.normal(-1.5, 0.01, 800)], axis=1)
+    points = np.concatenate([on_rings, floor[: len(on_rings)] + random.normal(scale=0.02, size=(len(on_rings), 3))])
+    order = np.argsort(np.tile(np.arange(len(on_rings)) // run, 2) * 2 + np.repeat([0, 1], len(on_rings)), kind="stable")
+    points = points[order].astype(np.float32)
+    tree, x = IkdTree(np.concatenate([wall, floor])), NavState.identity()
+    together, alone = _match(tree, x, points), [_match(tree, x, point[None]) for point in points]
+    assert 0.2 < (together.reach[:, 3] > 0.0).mean() < 0.8
+    for name in ("fate", "neighbours", "planes"):
+        np.testing.assert_array_equal(getattr(together, name), np.concatenate([getattr(one, name) for one in alone]))
+    np.testing.assert_array_equal(together.reach[:, 3], np.concatenate([one.reach[:, 3] for one in alone]))
+
+
 def test_an_empty_map_has_no_planes() -> None:
     points = np.ones((3, 3), np.float32)
     assert np.all(_match(IkdTree(), NavState.identity(), points).fate == FEW_NEIGHBOURS)
