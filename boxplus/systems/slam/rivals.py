@@ -95,10 +95,12 @@ def best_shift(
 def _agreement(
     query: NDArray[np.float32], place: NDArray[np.float32], T_place_query: Floats, cell: float, reach: float
 ) -> tuple[Floats, Floats]:
-    """Correlation (U, V) of the two density images over shifts (U, V, 2) of the query [m], sound up to `reach`."""
+    """Correlation (U, V) of the two density images over shifts (U, V, 2) of the query [m] up to `reach` at which they overlap."""
     moved = se3.act(T_place_query, query.astype(np.float64))[:, :2]
     there = place[:, :2].astype(np.float64)
     low = there.min(axis=0)
+    if len(moved):  # beyond that they have nothing in common; an odometry without data for a minute allows for kilometres
+        reach = min(reach, float(np.maximum(there.max(axis=0) - moved.min(axis=0), moved.max(axis=0) - low).max()))
     shape = np.ceil((there.max(axis=0) - low) / cell).astype(int) + 1
     inside = ((moved >= low - reach) & (moved <= low + shape * cell + reach)).all(axis=1)
     pad = int(np.ceil(reach / cell)) + 1

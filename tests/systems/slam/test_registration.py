@@ -112,3 +112,16 @@ def test_rows_of_columns_have_rivals_as_far_as_one_may_be_off(sigma: float, coun
     assert len(shifts) == 2 * count
     if count:
         np.testing.assert_allclose(np.sort(shifts[:, 0]), [-8.0, 8.0], atol=0.5)
+
+
+def test_an_odometry_that_knows_nothing_has_no_more_rivals_than_places_that_overlap() -> None:
+    """After a minute without data its standard deviation is kilometres, and images of all shifts within would be terabytes."""
+    random = np.random.default_rng(4)
+    points = (random.uniform(-1.0, 1.0, (4000, 3)) * [20.0, 10.0, 2.0]).astype(np.float32)
+    still = np.array([1.0, 0, 0, 0, 0, 0, 0])
+    found = [
+        rival_shifts(points, points, still, cell=0.5, least=1.5, sigma=sigma**2 * np.eye(2), share=0.1, count=3)
+        for sigma in (100.0, 1e6)
+    ]
+    assert len(found[0]) == 3
+    np.testing.assert_array_equal(*found)
