@@ -18,6 +18,7 @@ _FORMAT, _VERSION = "boxplus-slam-graph", 1
 _POSES = tuple(field.name for field in fields(Correction))
 _SHAPES: dict[str, tuple[int, ...]] = {"T_start": (7,), "T_place_query": (7,), "covariance": (6, 6), "information": (6, 6)}
 _INTEGERS = ("query", "place", "inliers", "measured")
+_TEXTS = ("refusal", "objection")  # the second is not in files of earlier versions
 _NUMBERS = ("rms", "rms_odometry", "innovation", "innovation_limit", "weight")
 
 
@@ -37,7 +38,8 @@ def write_graph(path: Path, outcome: SlamOutcome) -> None:
         content[f"loop_{name}"] = np.array([getattr(loop, name) for loop in loops], dtype=np.float64).reshape(n, *shape)
     content["loop_overlap"] = np.array([loop.overlap for loop in loops], dtype=np.float64).reshape(n, 2)
     content["loop_source"] = np.array([loop.source for loop in loops], dtype=np.str_)
-    content["loop_refusal"] = np.array([loop.refusal or "" for loop in loops], dtype=np.str_)
+    for name in _TEXTS:
+        content[f"loop_{name}"] = np.array([getattr(loop, name) or "" for loop in loops], dtype=np.str_)
     content["drift_scale"], content["T_world_map"] = np.array(outcome.drift_scale), outcome.T_world_map
     content["doubt"] = np.array(outcome.doubt or "")
     with atomic_file(path) as file:
@@ -73,4 +75,5 @@ def _loop(content: dict[str, Any], k: int) -> Loop:
     values |= {name: content[f"loop_{name}"][k] for name in _SHAPES}
     first, second = content["loop_overlap"][k].tolist()
     source = cast(Source, str(content["loop_source"][k]))
-    return Loop(**values, overlap=(first, second), source=source, refusal=str(content["loop_refusal"][k]) or None)
+    values |= {name: str(content[f"loop_{name}"][k]) or None for name in _TEXTS if f"loop_{name}" in content}
+    return Loop(**values, overlap=(first, second), source=source)

@@ -97,6 +97,20 @@ def pairs_without_maps(forbidden: Pairs, forced: Pairs, count: int) -> list[str]
     return sentences
 
 
+def objections_to_forced(loops: Sequence[Loop]) -> list[str]:
+    """What speaks against loops that a user forced, in sentences; whether they are believed all the same."""
+    sentences = []
+    for loop in loops:
+        pair = f"[{loop.query}, {loop.place}]"
+        if loop.source == "forced" and not loop.is_accepted:
+            sentences.append(f"the forced loop {pair} is not closed: {why_refused(loop)}")
+        elif loop.objection is not None:
+            sentences.append(
+                f"the forced loop {pair} is closed, although {loop.objection}; look in the report how the two lie over each other"
+            )
+    return sentences
+
+
 def _pairs(content: dict[str, object], key: str, path: str | Path, advice: str) -> Pairs:
     rows = content.get(key) or []
     found = []

@@ -28,7 +28,7 @@ from boxplus.runs.slam.corrected import write_corrected_map, write_corrected_tra
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
 from boxplus.runs.slam.gnss_output import gnss_facts, gnss_warnings, lay_onto_earth, write_georeference
 from boxplus.runs.slam.graph_file import write_graph
-from boxplus.runs.slam.loop_file import Pairs, pairs_without_maps, write_loops
+from boxplus.runs.slam.loop_file import Pairs, objections_to_forced, pairs_without_maps, write_loops
 from boxplus.runs.slam.loop_search import LoopSearch
 from boxplus.runs.slam.result import SlamResult
 from boxplus.runs.slam.spool import ScanSpool
@@ -201,6 +201,7 @@ class _Run:
         if not outcome.accepted:
             told.insert(0, LEFT_IN_PLACE)
         told += pairs_without_maps(*self._decided, len(correction.time_ns))
+        told += objections_to_forced(outcome.loops)
         doubt = doubt_of_odometry(odometry, earth) or outcome.doubt
         write_corrected_trajectory(own, outcome.placed, is_closed=bool(outcome.accepted))
         if earth is not None:

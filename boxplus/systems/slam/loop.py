@@ -27,6 +27,7 @@ class Loop:
         rms: of the distances to planes [m]; rms_odometry: the same between successive maps there.
         innovation: distance from what the odometry says, in standard deviations; innovation_limit: what a true loop may have.
         refusal: why it is not believed, in a sentence; None where it passed every test so far.
+        objection: what spoke against one that is believed all the same, as it is forced; None where nothing did.
         weight: in the pose graph: 1 believed, 0 refused.
     """
 
@@ -45,6 +46,7 @@ class Loop:
     innovation: float = float("nan")
     innovation_limit: float = float("nan")
     refusal: str | None = None
+    objection: str | None = None
     weight: float = 0.0
 
     @property
