@@ -38,6 +38,7 @@ from boxplus.systems.georeference.georeference import Georeference
 from boxplus.systems.slam.correction import Correction
 from boxplus.systems.slam.outcome import SlamOutcome
 from boxplus.systems.slam.slam import Slam
+from boxplus.systems.slam.upright_path import climb_within_upright_plane
 
 _KINDS = {  # beginnings of the sentences that refuse a loop
     "looks alike": "looks alike, but the odometry excludes it",
@@ -269,9 +270,16 @@ def _told_of_up(outcome: SlamOutcome, level: int | None) -> str:
         return "no IMU tells where down is, and nothing shows where up is: the map stands as the LiDAR did"
     maps = "the first local map do" if level == 0 else f"local map {level} do, those of earlier ones do not"
     tilt = np.degrees(2.0 * np.arccos(np.clip(outcome.T_world_map[0], -1.0, 1.0)))
-    return (
+    text = (
         f"no IMU tells where down is: surfaces of {maps}; trajectory and map are turned upright, by {tilt:.1f}° from where the "
         "LiDAR began"
+    )
+    climb = climb_within_upright_plane(outcome.placed.T_map[:, 4:])
+    if climb is None:
+        return text
+    return (
+        f"{text}; its path then lies in an upright plane and goes {climb:.1f} m up and down in it: if it stayed on the ground, "
+        "the LiDAR is mounted more than 45° from upright (on its side), and z of trajectory and map is not up"
     )
 
 

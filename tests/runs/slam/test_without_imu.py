@@ -12,6 +12,7 @@ from boxplus.formats.trajectory import read_trajectory
 from boxplus.manifolds import quaternion
 from boxplus.maps.local_maps import builder
 from boxplus.maps.local_maps.folder import LocalMapFolder
+from boxplus.runs.slam import slam_run
 from boxplus.runs.slam.config import load_slam_config
 from boxplus.runs.slam.folder import SlamFolder
 from boxplus.runs.slam.graph_file import read_graph
@@ -60,3 +61,9 @@ def test_the_first_map_that_shows_it_sets_the_map_upright(tmp_path: Path, monkey
         "no IMU tells where down is: surfaces of local map 2 do, those of earlier ones do not; trajectory and map are turned "
         f"upright, by {tilt:.1f}° from where the LiDAR began"
     ]
+
+
+def test_a_path_that_climbs_within_an_upright_plane_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slam_run, "climb_within_upright_plane", lambda p: 10.1 if p.shape[1] == 3 else None)
+    _, (told,) = run_where(iter([LEANING]), tmp_path / "out", monkeypatch)
+    assert "lies in an upright plane and goes 10.1 m up and down in it" in told and "mounted more than 45° from upright" in told
