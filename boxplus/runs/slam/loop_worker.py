@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 import traceback
-from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -51,7 +50,6 @@ def _read(source: IO[str], lines: queue.SimpleQueue[_Line]) -> None:
 def _work(lines: queue.SimpleQueue[_Line], answers: IO[str]) -> None:
     from boxplus.maps.local_maps.folder import LocalMapFolder
     from boxplus.runs.slam.graph_file import write_graph
-    from boxplus.systems.sessions.own_slip import own_slip
     from boxplus.systems.slam.config import SlamConfig
     from boxplus.systems.slam.slam import Slam
 
@@ -68,10 +66,7 @@ def _work(lines: queue.SimpleQueue[_Line], answers: IO[str]) -> None:
             answer["loops"] = [[loop.query, loop.place] for loop in slam.loops if loop.is_accepted]
             answer["p_map"] = [[round(value, 3) for value in T[4:].tolist()] for T in slam.T_map]
         _answer(answers, answer)
-    outcome = slam.outcome()
-    slip = own_slip(len(outcome.correction.time_ns), maps.__getitem__, outcome.loops, slam.config)
-    doubt = "; ".join(text for text in (slip, outcome.doubt) if text) or None
-    write_graph(Path(job["graph"]), replace(outcome, doubt=doubt))
+    write_graph(Path(job["graph"]), slam.outcome())
     _answer(answers, {"end": True})
 
 

@@ -32,7 +32,6 @@ from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
 from boxplus.systems.sessions.graph import JoinedGraph, join
 from boxplus.systems.sessions.kind import lead_of
-from boxplus.systems.sessions.likeness import is_one_alignment
 from boxplus.systems.sessions.open_axis import moved_along, open_axis, shift_along
 from boxplus.systems.sessions.other_alignments import fits_otherwise, other_alignments
 from boxplus.systems.sessions.places import Places
@@ -51,6 +50,7 @@ _CLEAR = 0.35  # lead over other alignments up to which two of a kind cannot be 
 _TILT, _YAW = 0.03, 0.1  # rad, of a proposal
 _RIVAL_AGREEMENT = 0.6  # of density images, for a rival that is turned
 _TOLERANCE, _RMS_FLOOR = 2.5, 0.02  # standard deviations, m: within which a point fits
+_BASIN_ROTATION, _BASIN_POSITION, _BASIN_DRIFT = 0.2, 4.0, 0.03  # rad, m, m/m: by which two likenesses of one alignment differ
 _PREDICTED = 2  # places that are looked at for each local map of the query session
 _AS_WELL = "the maps fit as well"  # begins what is said of a rival
 _FEWEST_STANDING = 100  # points, of all encounters together
@@ -198,8 +198,13 @@ class _Meeting:
         kept = []
         for a, (number, proposal) in enumerate(proposals):
             for b, (other, _) in enumerate(proposals):
-                way_m = self.query.way(number, other)
-                if other != number and is_one_alignment(anchors[a], anchors[b], T_query[other], way_m):
+                if other == number:
+                    continue
+                xi = se3.log(
+                    se3.compose(se3.inverse(se3.compose(anchors[a], T_query[other])), se3.compose(anchors[b], T_query[other]))
+                )
+                far = _BASIN_POSITION + _BASIN_DRIFT * self.query.way(number, other)
+                if np.linalg.norm(xi[:3]) <= _BASIN_ROTATION and np.linalg.norm(xi[3:]) <= far:
                     kept.append((number, proposal))
                     break
         return kept
