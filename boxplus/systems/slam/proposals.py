@@ -73,19 +73,6 @@ class Proposer:
             self._contexts.add(context)
         return found + (_near(query, odometry, before, T_map, self._config) if before > 0 else [])
 
-    def alike(self, query: int, place: int, maps: Maps) -> list[Floats]:
-        """T_place_query (7,) that the looks of two local maps suggest, wherever the estimate has them; both were proposed for."""
-        own, there = maps(query), maps(place)
-        found: list[Proposal] = []
-        if self._config.appearance == "density":
-            candidate = self._densities.align(described(own, self._config), place, seed=query)
-            found += [] if candidate is None else [seen(candidate)]
-        if len(own.points) and len(there.points):
-            contexts = (scan_context(local_map.points, self._config.context_range) for local_map in (own, there))
-            _, yaw = next(contexts).distance(next(contexts))
-            found.append(turned(own, there, place, yaw, self._config))
-        return [proposal.T_start for proposal in found]
-
 
 def described(local_map: LocalMap, config: SlamConfig) -> Features:
     """The features of a local map; none of one without points."""

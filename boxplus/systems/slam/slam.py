@@ -45,7 +45,7 @@ class Slam:
     Args:
         config: settings; each has a default.
         forbidden: pairs of local maps that are no loop, whatever they look like.
-        forced: pairs that are one: no test refuses it. Registered from where the map has them, or from how they look alike.
+        forced: pairs that are one: no test refuses it, and it is registered from where the odometry has it.
         stored: where a local map that was added can be read again by its number, such as a `LocalMapFolder`'s; then none of their
             points stay in memory. None keeps them.
 
@@ -231,23 +231,12 @@ class Slam:
         return [Proposal(place, se3.compose(se3.inverse(T[place]), T[query]), "forced") for place in wanted] + free
 
     def _verified(self, query: int, proposal: Proposal) -> Loop:
-        return self._forced_loop(query, proposal) if proposal.source == "forced" else self._laid(query, proposal)
-
-    def _forced_loop(self, query: int, proposal: Proposal) -> Loop:
-        """From where the map has the two, and where they do not fit there, as they look alike: the odometry may have slipped."""
-        loop = self._laid(query, proposal)
-        if loop.refusal is not None:
-            alike = self._proposer.alike(query, proposal.place, self._map)
-            loop = max(
-                [loop, *(self._laid(query, replace(proposal, T_start=T)) for T in alike)], key=lambda one: min(one.overlap)
-            )
-        return replace(loop, refusal=None, objection=loop.refusal) if loop.information.any() else loop
-
-    def _laid(self, query: int, proposal: Proposal) -> Loop:
         rms = max(self._rms[query], self._rms[proposal.place])
         maps = self._maps[query], self._maps[proposal.place]
         surfaces = self._surface(query), self._surface(proposal.place)
-        return verify(proposal, maps, surfaces, rms, self._odometry, self.config)
+        loop = verify(proposal, maps, surfaces, rms, self._odometry, self.config)
+        is_believed_anyhow = proposal.source == "forced" and loop.information.any()
+        return replace(loop, refusal=None, objection=loop.refusal) if is_believed_anyhow else loop
 
     def _rms_of_odometry(self, query: int) -> float:
         """How well a map fits the one before it: what the odometry's own errors make of surfaces [m]."""

@@ -68,17 +68,16 @@ def test_a_forbidden_loop_is_not_looked_at_and_a_forced_one_is_believed(block: M
     assert [(loop.query, loop.place, loop.source, loop.is_accepted) for loop in forced.loops] == [(*pairs[0], "forced", True)]
 
 
-def test_a_forced_loop_is_found_where_the_odometry_slipped(block: MappedDrive, slam: Slam) -> None:
-    """By 12 m before its query: from where the map has the two it came to rest 11 m off, was believed, and nothing said so."""
+def test_what_speaks_against_a_forced_loop_is_kept(block: MappedDrive, slam: Slam) -> None:
+    """The odometry slipped by 12 m before its query: from where the map has the two the registration comes to rest 11 m off."""
     query, place = next((loop.query, loop.place) for loop in slam.loops if loop.is_accepted)
     jump = np.array([1.0, 0.0, 0.0, 0.0, 7.0, -10.0, 0.0])
     maps = [replace(m, T_odo_map=se3.compose(jump, m.T_odo_map)) if m.number > place + 1 else m for m in block.maps]
-    forced = closed(replace(block, maps=maps), SlamConfig(appearance="none", nearby=0.0), forced=[(query, place)])
-    (loop,) = forced.loops
-    assert loop.is_accepted and np.linalg.norm(block.error(loop)[3:]) < 0.25
-    assert loop.objection is not None and "standard deviations from the odometry" in loop.objection
-    sound = closed(block, SlamConfig(appearance="none", nearby=0.0), forced=[(query, place)])
-    assert sound.loops[0].is_accepted and sound.loops[0].objection is None
+    (slipped,) = closed(replace(block, maps=maps), SlamConfig(appearance="none", nearby=0.0), forced=[(query, place)]).loops
+    assert slipped.is_accepted and np.linalg.norm(block.error(slipped)[3:]) > 5.0
+    assert slipped.objection == "the surfaces determine 4 of 6 directions only"
+    (sound,) = closed(block, SlamConfig(appearance="none", nearby=0.0), forced=[(query, place)]).loops
+    assert sound.is_accepted and sound.objection is None
 
 
 def test_without_opencv_places_are_still_found(block: MappedDrive, monkeypatch: pytest.MonkeyPatch) -> None:
