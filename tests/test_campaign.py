@@ -287,12 +287,12 @@ def test_a_field_in_which_nothing_shows_the_rotation_at_rest_turns_nothing_as_it
 def test_a_sound_run_from_seed_to_report(campaign: SimpleNamespace, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     draw = campaign.draws.draw(seed)
     short = replace(draw, duration_s=4.0)
-    monkeypatch.setattr(campaign.run, "draw", lambda _, **__: short)
+    monkeypatch.setattr(campaign.run, "draw", lambda *_: short)
     line = campaign.run.run_seed(seed)
     assert (line["verdict"], line["exit_code"]) == ("right", 0)
     assert line["worst_m"] < 0.05
     spoiled = replace(short, kinds=replace(short.kinds, fault="accel_unit", bag="true"), spoiled=faults.imu_in_g())
-    monkeypatch.setattr(campaign.run, "draw", lambda _, **__: spoiled)
+    monkeypatch.setattr(campaign.run, "draw", lambda *_: spoiled)
     seen_through = campaign.run.run_seed(seed)
     assert (seen_through["verdict"], seen_through["bag"]) == ("right", "true")
     text = campaign.report.report([line, seen_through | {"verdict": "silent", "reasons": ["error"]}])
