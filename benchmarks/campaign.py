@@ -34,17 +34,12 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # a spawned process knows the script, not its folder
 
-from lio_campaign.draws import draw_kinds
+from lio_campaign.draws import VARIETIES, draw_kinds
 from lio_campaign.real import why_not
 from lio_campaign.report import against, describe, report
 from lio_campaign.run import run_real, run_seed
 
 _SMALL, _NIGHTLY = 40, 1000
-_VARIETIES = {
-    "fast": "on roads, at up to 33 m/s",
-    "still": "platforms that sway, hover, creep, float, pan, or stop again and again",
-    "odd": "with other LiDARs, mountings and rates of the IMU",
-}
 _SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
 
@@ -133,8 +128,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--real", type=int, metavar="N", help="N recordings with a real IMU and motion, from the first seed on")
     parser.add_argument("--rough", action="store_true", help="with rain, people, lost packets and the like")
     variety = parser.add_mutually_exclusive_group()
-    for name, what in _VARIETIES.items():
-        variety.add_argument(f"--{name}", dest="variety", action="store_const", const=name, help=f"{what}; not with --real")
+    for name in [name for name in VARIETIES if name != "usual"]:
+        about = f"{VARIETIES[name].what}; not with --real"
+        variety.add_argument(f"--{name}", dest="variety", action="store_const", const=name, help=about)
     parser.set_defaults(variety="usual")
     parser.add_argument("--against", type=Path, metavar="FILE", help="earlier lines of the same seeds: what ended otherwise")
     parser.add_argument("--shared", type=Path, default=_SHARED, help="folder with tools/make_lio_recording.py and data/imu")

@@ -193,6 +193,7 @@ class Variety:
     """What one kind of campaign draws from.
 
     Attributes:
+        what: in words.
         motions: the worlds that suit each motion.
         places: of the worlds.
         motion: draws one, which may be longer than asked for.
@@ -201,6 +202,7 @@ class Variety:
         mounting: draws T_imu_lidar (4, 4), near the IMU or anywhere.
     """
 
+    what: str
     motions: Mapping[str, tuple[str, ...]]
     places: Mapping[str, Callable[[np.random.Generator], Place]]
     motion: DrawMotion
@@ -210,17 +212,23 @@ class Variety:
     mounting: Callable[[bool, np.random.Generator], NDArray[np.float64]] = _mounting
 
 
-_USUAL = Variety(places.MOTIONS, places.PLACES, places.usual_motion)
+_USUAL = Variety("the usual", places.MOTIONS, places.PLACES, places.usual_motion)
 VARIETIES = {
     "usual": _USUAL,
-    "fast": Variety(roads.MOTIONS, roads.PLACES, roads.fast_motion),
-    "still": Variety(hardly_moving.MOTIONS, places.PLACES, hardly_moving.hardly_moving),
+    "fast": Variety("on roads, at up to 33 m/s", roads.MOTIONS, roads.PLACES, roads.fast_motion),
+    "still": Variety(
+        "platforms that sway, hover, creep, float, pan, or stop again and again",
+        hardly_moving.MOTIONS,
+        places.PLACES,
+        hardly_moving.hardly_moving,
+    ),
     "odd": replace(
         _USUAL,
+        what="with other LiDARs, mountings and rates of the IMU",
         sensors=unusual.SENSORS,
         lidar=unusual.lidar,
         imu_rates_hz=unusual.IMU_RATES_HZ,
         mounting=unusual.any_mounting,
     ),
 }
-"""What a campaign varies: the usual, on roads at up to 33 m/s, platforms that hardly move, and sensors of unusual.py."""
+"""What a campaign may draw from."""

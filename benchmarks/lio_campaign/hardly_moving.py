@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from boxplus.manifolds import so3
 from boxplus.simulation.motions.spline import SplineTrajectory, Trajectory
 from boxplus.simulation.motions.thrust import ThrustTrajectory
-from boxplus.simulation.motions.trajectories import START_NS, control_times, fade_in, from_angles
+from boxplus.simulation.motions.trajectories import START_NS, STEEPEST, control_times, fade_in, from_angles
 from lio_campaign.places import Place
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ def hardly_moving(motion: str, world: str, place: Place, duration_s: float, rand
     if motion == "hover":
         return _hovering(middle, yaw, duration_s, rest_s, random)
     time = control_times(duration_s, _KNOT_S)
-    begun = np.ones_like(time) if rest_s == 0.0 else fade_in(time, rest_s, 1.5)
+    begun = _begun(time, rest_s)
     p, angles = np.tile(middle, (len(time), 1)), np.zeros((len(time), 3))
     if motion == "sway":
         p += begun[:, None] * _waves(time, random.uniform(0.002, 0.03, 3) * (1.0, 1.0, 0.3), (0.2, 1.4), random)
@@ -77,6 +77,11 @@ def hardly_moving(motion: str, world: str, place: Place, duration_s: float, rand
     return SplineTrajectory(START_NS, _KNOT_S, R, p)
 
 
+def _begun(time: Floats, rest_s: float) -> Floats:
+    """(K,) 0 at rest, 1 in motion, all along where there is no rest."""
+    return np.ones_like(time) if rest_s == 0.0 else fade_in(time, rest_s, 1.5)
+
+
 def _waves(time: Floats, amplitude: Floats, hertz: tuple[float, float], random: np.random.Generator) -> Floats:
     """(K, n) two sines a column within a band, which do not repeat."""
     out = np.zeros((len(time), len(amplitude)))
@@ -92,7 +97,7 @@ def _sweeps(time: Floats, rest_s: float, random: np.random.Generator) -> Floats:
     angle, begin_s = np.zeros_like(time), rest_s
     while begin_s < time[-1]:
         by = random.choice((-1.0, 1.0)) * random.uniform(0.3, 3.0)
-        lasts_s = 1.875 * abs(by) / random.uniform(0.15, 1.2)
+        lasts_s = STEEPEST * abs(by) / random.uniform(0.15, 1.2)
         angle += by * fade_in(time, begin_s, lasts_s)
         begin_s += lasts_s + random.uniform(0.0, 3.0)
     return angle
@@ -110,8 +115,8 @@ def _goes(time: Floats, rest_s: float, random: np.random.Generator) -> Floats:
 
 def _hovering(middle: Floats, yaw: float, duration_s: float, rest_s: float, random: np.random.Generator) -> ThrustTrajectory:
     knot_s = 0.1
-    time = np.arange(-2, int(np.ceil(duration_s / knot_s - 1e-9)) + 3, dtype=np.float64) * knot_s
-    begun = np.ones_like(time) if rest_s == 0.0 else fade_in(time, rest_s, 1.5)
+    time = control_times(duration_s, knot_s, beyond=2)
+    begun = _begun(time, rest_s)
     slow = _waves(time, random.uniform(0.03, 0.3, 3), (0.03, 0.25), random)
     quick = _waves(time, random.uniform(0.0, 0.02, 3), (0.4, 1.0), random)
     p = middle + begun[:, None] * (slow + quick)

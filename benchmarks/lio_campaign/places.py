@@ -201,8 +201,8 @@ def _lift(place: Place, duration_s: float, random: np.random.Generator) -> Traje
     upwards = random.uniform() < 0.5
     begin[2] = low[2] if upwards else high[2]
     rest = random.uniform(1.5, 3.0)
-    speed = max(random.uniform(0.3, 1.5), rise * 1.875 / (duration_s - rest - 2.0))
-    rest = max(rest, duration_s - 1.0 - rise / speed * 1.875)
+    speed = max(random.uniform(0.3, 1.5), rise * trajectories.STEEPEST / (duration_s - rest - 2.0))
+    rest = max(rest, duration_s - 1.0 - rise / speed * trajectories.STEEPEST)
     attitude = manoeuvres.level(random.uniform(-np.pi, np.pi), *random.uniform(-0.05, 0.05, 2))
     return manoeuvres.lift(begin, rise if upwards else -rise, speed, rest, attitude)
 

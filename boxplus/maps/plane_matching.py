@@ -85,9 +85,7 @@ def match_planes(
         known = n if warm else n - 1
         has_known = warm or n > begin
         seen = reach[known] if has_known else reach[n]
-        asked = (
-            has_known and seen[3] > 0.0
-        )  # on a line before, it will be on one again: one search for fifteen finds five as well
+        asked = has_known and seen[3] > 0.0  # on a line there, on one here: one search for fifteen finds five as well
         found = np.int64(0)
         if asked:
             moved = math.sqrt((seen[0] - qx) ** 2 + (seen[1] - qy) ** 2 + (seen[2] - qz) ** 2)

@@ -9,7 +9,7 @@ from boxplus.errors import InputError
 from boxplus.manifolds import so3
 from boxplus.simulation.motions.spline import SplineTrajectory
 from boxplus.simulation.motions.thrust import ThrustTrajectory
-from boxplus.simulation.motions.trajectories import START_NS, along_route, control_times, fade_in, from_angles
+from boxplus.simulation.motions.trajectories import START_NS, STEEPEST, along_route, control_times, fade_in, from_angles
 from boxplus.simulation.worlds.sites import STOREY_M
 
 Floats = NDArray[np.float64]
@@ -66,7 +66,7 @@ def lift(
         standstill_s: rest before; a second follows after.
         R_world_imu: (3, 3) attitude, level when not given.
     """
-    ride_s = abs(rise) / speed * 1.875  # the peak of the slope of `fade_in`
+    ride_s = abs(rise) / speed * STEEPEST
     time = control_times(standstill_s + ride_s + 1.0, _KNOT_S)
     p = np.broadcast_to(np.asarray(p_start, dtype=np.float64), (len(time), 3)).copy()
     p[:, 2] += rise * fade_in(time, standstill_s, ride_s)
@@ -125,7 +125,7 @@ def drone_within(
     """
     random = np.random.Generator(np.random.PCG64([seed, 11]))
     knot_s = 0.1
-    time = np.arange(-2, int(np.ceil(duration_s / knot_s - 1e-9)) + 3, dtype=np.float64) * knot_s
+    time = control_times(duration_s, knot_s, beyond=2)
     course = _travelled(time, standstill_s)
     p = _wandering(course, low, high, speed, random)
     frequency, phase = 2.0 * np.pi * random.uniform(0.03, 0.12), random.uniform(0.0, 2.0 * np.pi)

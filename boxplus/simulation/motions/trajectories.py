@@ -150,11 +150,17 @@ def drone(duration_s: float = 60.0, speed: float = 3.0, height: float = 8.0, sta
     return SplineTrajectory(START_NS, knot_s, from_angles(-leftward / 9.81, forward / 9.81, yaw), p)
 
 
-def control_times(duration_s: float, knot_s: float) -> Floats:
-    """Times of the control poses of a motion of `duration_s`, relative to its start."""
+def control_times(duration_s: float, knot_s: float, beyond: int = 1) -> Floats:
+    """Times of the control poses of a motion of `duration_s`, relative to its start.
+
+    `beyond` are those before its start and after its end: one for cubic splines, two for quintic ones.
+    """
     if not duration_s > 0:
         raise InputError("a positive duration [s]", f"{duration_s}", "give the length of the motion")
-    return np.arange(-1, int(np.ceil(duration_s / knot_s - 1e-9)) + 2, dtype=np.float64) * knot_s
+    return np.arange(-beyond, int(np.ceil(duration_s / knot_s - 1e-9)) + beyond + 1, dtype=np.float64) * knot_s
+
+
+STEEPEST = 1.875  # slope of `fade_in` at its middle, times the seconds that it takes
 
 
 def fade_in(time: Floats, start_s: float, ease_s: float = _EASE_S) -> Floats:
