@@ -20,9 +20,10 @@ from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.downsampling import VoxelFilter
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
+from boxplus.systems.lidar_inertial_agreement.lidar_path.scan_pattern import recurs
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shifted_scans import cost_of, shifts_show, unmoved_map
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns
-from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surfaces_across
+from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import fresh_surfaces_across, surfaces_across
 
 _DETERMINED_M_S = 0.15  # standard deviation of the speed along an axis
 _SLOW_M_S, _SLOW_RAD_S = 0.03, 0.01
@@ -34,6 +35,7 @@ _CREEP_M_S, _CREEP_RAD_S = 0.15, 0.25
 _AS_WELL = 1.1  # times the cost
 _COMPARED, _POINTS = 3, 3000
 _MOST_MAP_POINTS = 5000
+_LOOKED_AT = 5  # scans, where each one sees something else
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,25 +92,33 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
     swings = (np.abs(p @ along) > 2.0 * near).any() or np.linalg.norm(turned @ shown, axis=1).max() > _SWING_RAD
     at_rest = bool(not swings and ((slow and rate < _SLOW_RAD_S) or (creeps and _fits_unmoved(path, scans, config))))
     open_axes = axes[:, ~seen].T
-    if at_rest and seen.all() and not faces(path, scans, config, axes[:, 0]):
-        open_axes = axes[:, :1].T
+    if at_rest and seen.any():  # noise may seem to show an axis: those it is known least along are asked first
+        facing = faces(path, scans, config, axes[:, seen].T)
+        hardly = int(np.argmax(facing)) if facing.any() else len(facing)
+        open_axes = axes[:, : len(open_axes) + hardly].T
     if at_rest and len(open_axes) == 1 and len(last) == len(scans) and shifts_show(scans, open_axes[0], config):
         open_axes = open_axes[:0]
     return Rest(at_rest, open_axes, not_shown.T, speed, rate)
 
 
-def faces(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, axis: NDArray[np.float64]) -> bool:
-    """Whether surfaces across an axis (3,), in the frame of the path's first pose, would show a motion along it."""
+def faces(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, axes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Along which unit axes (K, 3), in the frame of the path's first pose, surfaces that face them would show a motion: (K,)."""
     tree = IkdTree(cell_size=config.map_cell, rebuild="inplace")
     voxel_filter = VoxelFilter(config.map_cell, _MOST_MAP_POINTS)
+
+    def placed(points: NDArray[np.float32], k: int) -> NDArray[np.float64]:
+        return np.asarray(points.astype(np.float64) @ path.R_path_lidar[k].T + path.p_path_lidar[k])
+
     for k, scan in enumerate(scans):
-        placed = voxel_filter(scan.p_lidar)[1].astype(np.float64) @ path.R_path_lidar[k].T + path.p_path_lidar[k]
-        tree.insert(placed, downsample=True)
+        tree.insert(placed(voxel_filter(scan.p_lidar)[1], k), downsample=True)
+    if not recurs(scans):
+        some = np.unique(np.linspace(0, len(scans) - 1, _LOOKED_AT).round().astype(int))
+        points = np.concatenate([placed(voxel_filter(scans[k].p_lidar)[0], k) for k in some])
+        return np.array([fresh_surfaces_across(tree, points, axis) for axis in axes])
     p_lidar = voxel_filter(scans[-1].p_lidar)[0]
-    x = path.packed(-1)
-    information = PlaneMeasurement(p_lidar, tree, config, with_extrinsic=False).at(x, rematch=True)
-    points = p_lidar.astype(np.float64) @ path.R_path_lidar[-1].T + path.p_path_lidar[-1]
-    return surfaces_across(tree, points, path.p_path_lidar[-1], axis, information.directions.ratio_along(axis))
+    information = PlaneMeasurement(p_lidar, tree, config, with_extrinsic=False).at(path.packed(-1), rematch=True)
+    points, sensor, ratio_along = placed(p_lidar, -1), path.p_path_lidar[-1], information.directions.ratio_along
+    return np.array([surfaces_across(tree, points, sensor, axis, ratio_along(axis)) for axis in axes])
 
 
 def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig) -> bool:

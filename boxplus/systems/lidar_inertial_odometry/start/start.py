@@ -302,7 +302,7 @@ def _check_slowness(seen: Beginning, path: LidarPath) -> None:
     seconds, along = (path.time_ns - path.time_ns[0]) * 1e-9, path.p_path_lidar @ axes[0]
     if float(np.std(along - np.polyval(np.polyfit(seconds, along, 1), seconds))) > _STEADY_M:
         return
-    if not faces(path, seen.scans, seen.registration, axes[0]):
+    if not faces(path, seen.scans, seen.registration, axes[:1]).all():
         raise seen.not_moving(undecided(axes))
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from boxplus.manifolds import so3
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import ImuModel, OmniLidar, RosetteLidar, Scenario, Simulation, SpinningLidar, World
 from boxplus.simulation.motions import manoeuvres
 from boxplus.simulation.worlds import sites, worlds
 from boxplus.systems.lidar_inertial_agreement.lidar_path import shifted_scans
+from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import with_cells_for_all
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shifted_scans import shifts_show
 
 CONFIG = RegistrationConfig()
@@ -38,6 +40,20 @@ def test_a_place_with_things_in_it_shows_every_shift(lidar: SpinningLidar | Rose
 def test_a_smooth_tunnel_shows_none_along_it(lidar: SpinningLidar | RosetteLidar | OmniLidar, speed: float) -> None:
     """Whether the LiDAR rests there or drives through."""
     assert not shifts_show(scans_of(sites.tunnel(), lidar, speed), np.eye(3)[0], CONFIG)
+
+
+@pytest.mark.parametrize(("y", "yaw", "pitch", "seed"), [(1.1, 90, 5, 2), (1.1, 90, 5, 5), (2.2, 125, 0, 0), (2.2, 125, 0, 2)])
+def test_a_narrow_view_of_the_wall_of_a_tunnel_shows_none_along_it(y: float, yaw: float, pitch: float, seed: int) -> None:
+    """Where nearly every point lies on the wall, the few that do not are half of what a shift costs."""
+    R = so3.exp(np.deg2rad(yaw) * np.eye(3)[2]) @ so3.exp(np.deg2rad(pitch) * np.eye(3)[1])
+    T = np.eye(4)
+    T[:3, :3] = R
+    motion = manoeuvres.constant_velocity(2.0, (-10.0, y, 1.8), (7.5, 0.0, 0.0), np.eye(3))
+    lidar = RosetteLidar(points_per_scan=20_000, fov_deg=62.0, range_sigma_m=0.0106, max_range=90.0)
+    world = sites.tunnel(500.0, lamp_spacing=17.53)
+    simulation = Simulation(Scenario("aside", world, motion, lidar, ImuModel(), T), seed, 1.2)
+    scans = [simulation.scan(k) for k in range(SCANS)]
+    assert not shifts_show(scans, R[0], with_cells_for_all(scans, CONFIG))
 
 
 def test_what_goes_along_with_the_lidar_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
