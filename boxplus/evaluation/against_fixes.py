@@ -16,6 +16,7 @@ from boxplus.manifolds import quaternion
 from boxplus.sensors.satellites.geodesy import EnuFrame
 from boxplus.sensors.satellites.gnss import GnssFixes
 from boxplus.systems.georeference.attachment import poses_between
+from boxplus.systems.georeference.held import HELD, held, longest_hold
 from boxplus.systems.georeference.start import extent_of, find_start
 
 _KINDS = {
@@ -35,7 +36,8 @@ class FixComparison:
     Attributes:
         frame: the origin of the comparison. alignment: that brought the antenna's path into it.
         time_ns: (M,) of the fixes compared; error_enu: (M, 3) trajectory less fix, east, north, up [m].
-        unmatched: fixes outside of the trajectory's time or in its gaps. rejected: fixes that are no position, by reason.
+        unmatched: fixes outside of the trajectory's time or in its gaps. rejected: fixes that are no position, or that of some
+            time ago, by reason.
         sigma_m: median of the standard deviations stated, of a horizontal axis; None where none is.
         warnings: what to doubt about the numbers.
     """
@@ -110,7 +112,8 @@ def compare_with_fixes(
 
     Args:
         estimate: poses of a body.
-        fixes: of the receiver, taken as they are: errors of it count as the estimate's.
+        fixes: of the receiver, taken as they are: errors of it count as the estimate's. Only those are left out that repeat the
+            position before while the trajectory moves: they say where the antenna was some time ago.
         alignment: `yaw` (heading and place, by fixes most others agree with), `se3`, `sim3`, or `none` for a
             trajectory that is in ENU of `frame`.
         lever_arm: (3,) the antenna in the body's frame [m]; zero where left out, with a warning.
@@ -135,12 +138,23 @@ def compare_with_fixes(
         raise InputError("lever_arm of shape (3,)", f"shape {lever.shape}", "give metres in the body's frame")
     T = np.hstack([estimate.q_wxyz, estimate.p])
     inside, follows, poses, _ = poses_between(estimate.time_ns + round(offset_s * 1e9), T, fixes.time_ns)
-    matched = np.flatnonzero(inside & follows)
-    if len(matched) < max(min_matches, 1):
+    within = np.flatnonzero(inside & follows)
+    if len(within) < max(min_matches, 1):
         raise InputError(
-            f"at least {min_matches} fixes within the time of the trajectory", f"{len(matched)} of {len(fixes)}",
+            f"at least {min_matches} fixes within the time of the trajectory", f"{len(within)} of {len(fixes)}",
             "check that both have the same clock; offset_s shifts the estimate",
         )  # fmt: skip
+    is_held = held(fixes.lat_lon_alt[within], poses[within, 4:])
+    matched = within[~is_held]
+    if len(matched) < max(min_matches, 1):
+        raise InputError(
+            f"at least {min_matches} positions of the receiver",
+            f"{len(matched)}; the other {int(is_held.sum())} fixes repeat the position before while the path goes on",
+            "look at the receiver and its driver: it hangs",
+        )
+    hold = longest_hold(fixes.time_ns[within], fixes.lat_lon_alt[within], poses[within, 4:], is_held)
+    hung = (hold.text,) if hold is not None and hold.lasts else ()
+    rejected = dict(fixes.rejected) | ({HELD: int(is_held.sum())} if is_held.any() else {})
     poses = poses[matched]
     p = poses[:, 4:] + quaternion.to_matrix(poses[:, :4]) @ lever
     frame = frame if frame is not None else EnuFrame(*fixes.lat_lon_alt[matched[0]].tolist())
@@ -152,8 +166,8 @@ def compare_with_fixes(
     found = align(p[heard], p_enu[heard], alignment)
     error = found.scale * p @ found.R_world_estimate.T + found.p_world_estimate - p_enu
     return FixComparison(
-        frame, found, fixes.time_ns[matched], error, len(fixes) - len(matched), dict(fixes.rejected), sigma,
-        tuple(_doubts(error, sigma, lever_arm is not None, estimate.warnings)),
+        frame, found, fixes.time_ns[matched], error, len(fixes) - len(within), rejected, sigma,
+        tuple(_doubts(error, sigma, lever_arm is not None, (*estimate.warnings, *hung))),
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from boxplus.recordings.gnss_source import read_fixes
 from boxplus.runs.slam.gnss_output import read_origin
 from boxplus.sensors.satellites.geodesy import EnuFrame
 from boxplus.simulation.gnss import GnssConfig, simulate_gnss
+from boxplus.systems.georeference.held import HELD
 from tests.bags import START_NS, Content, write_bag
 
 ORIGIN = EnuFrame(49.0, 8.4, 115.0)
@@ -72,6 +74,23 @@ def test_multipath_is_doubted_and_what_cannot_be_compared_refused() -> None:
     assert len(late.time_ns) == len(found.time_ns)
     with pytest.raises(InputError, match="lever_arm"):
         compare_with_fixes(trajectory(time_ns, T), fixes, lever_arm=[1.0])
+
+
+def test_positions_that_a_receiver_repeats_are_no_error_of_the_trajectory() -> None:
+    time_ns, T = eight()
+    fixes = simulate_gnss(time_ns, T, ORIGIN, GnssConfig(sigma=0.1, slow_sigma=0.0))
+    rows = np.arange(len(fixes))
+    for hangs, is_said in ((rows // 5 * 5, False), (np.where((rows >= 50) & (rows < 100), 50, rows), True)):
+        found = compare_with_fixes(
+            trajectory(time_ns, T), replace(fixes, lat_lon_alt=fixes.lat_lon_alt[hangs]), lever_arm=[0, 0, 0]
+        )
+        assert found.horizontal.max < 1.0
+        assert found.rejected == {HELD: int((hangs != rows).sum())} and found.unmatched == 0
+        assert any("repeated one position for 10 s from 10 s on" in text for text in found.warnings) == is_said
+    with pytest.raises(InputError, match="it hangs"):
+        compare_with_fixes(
+            trajectory(time_ns, T), replace(fixes, lat_lon_alt=np.repeat(fixes.lat_lon_alt[:1], len(fixes), axis=0))
+        )
 
 
 def test_the_command_compares_with_the_fixes_of_a_bag(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from boxplus.manifolds import quaternion, se3
 from boxplus.sensors.satellites.geodesy import EnuFrame
 from boxplus.sensors.satellites.gnss import GnssFixes
 from boxplus.systems.georeference.config import GeoreferenceConfig
+from boxplus.systems.georeference.held import HELD, Hold, held, longest_hold
 from boxplus.systems.slam.graph import MapGraph
 
 Floats = NDArray[np.float64]
@@ -32,6 +33,7 @@ class AttachedFixes:
         half_of: (N,) number of the half of a local map, before or after its pose: in one the drift is shared.
         walked: (N,) variance of an axis that the odometry gained by drifting at random since the first local map [m²].
         left_out: fixes that are not among them, by reason.
+        hold: the longest stretch in which the receiver repeated a position while the odometry moved; None where there is none.
     """
 
     time_ns: NDArray[np.int64]
@@ -44,6 +46,7 @@ class AttachedFixes:
     half_of: NDArray[np.intp]
     walked: Floats
     left_out: Counter[str]
+    hold: Hold | None = None
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -80,7 +83,11 @@ def attach(
     inside, follows, T_odo, v_odo = poses_between(time_ns, T_odo_imu, t)
     _count(left_out, "outside of the odometry's time", ~inside)
     _count(left_out, "in a gap of the odometry", inside & ~follows)
-    keep = np.flatnonzero(inside & follows)
+    known = np.flatnonzero(inside & follows)
+    is_held = held(fixes.lat_lon_alt[known], T_odo[known, 4:])
+    _count(left_out, HELD, is_held)
+    hold = longest_hold(t[known], fixes.lat_lon_alt[known], T_odo[known, 4:], is_held)
+    keep = known[~is_held]
     chosen = keep[_one_each(t[keep], config.interval)]
     if len(keep) > len(chosen):
         left_out["one of several within the interval"] = len(keep) - len(chosen)
@@ -102,6 +109,7 @@ def attach(
         half_of=2 * map_of + is_after,
         walked=walked,
         left_out=left_out,
+        hold=hold,
     )
 
 

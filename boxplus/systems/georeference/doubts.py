@@ -82,6 +82,8 @@ def doubts_of(
             f"the lever arm of the antenna is not known: estimated as {lever} m in the IMU frame, to "
             f"{float(np.max(found.lever_sigma[:2])):.2f} m on the ground; give --gnss-lever-arm"
         )
+    if attached.hold is not None and attached.hold.lasts:
+        warnings.append(attached.hold.text)
     if abs(found.delay) > max(_SIGMAS * found.delay_sigma, _LEAST_DELAY):
         late = "late" if found.delay > 0 else "early"
         warnings.append(
