@@ -22,7 +22,7 @@ class GeoreferenceConfig(Settings):
         None, description="antenna in the IMU's frame [m]; null: the recording's, and where it has none, estimated"
     )
     lever_sigma: float = Field(1.0, gt=0, description="standard deviation of a lever arm that nobody gave, about zero [m]")
-    time_offset_s: float = Field(0.0, ge=-10, le=10, description="added to the times of the fixes [s]")
+    time_offset_s: float = Field(0.0, ge=-60, le=60, description="added to the times of the fixes [s]")
     delay_sigma: float = Field(0.1, gt=0, description="standard deviation of how late fixes are stamped beyond that [s]")
     sigma: float = Field(3.0, gt=0, description="of east and north where the receiver states none; up: twice of it [m]")
     least_sigma: float = Field(0.02, gt=0, description="no fix is believed better than this [m]")

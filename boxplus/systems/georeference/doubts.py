@@ -85,10 +85,12 @@ def doubts_of(
     if attached.hold is not None and attached.hold.lasts:
         warnings.append(attached.hold.text)
     if abs(found.delay) > max(_SIGMAS * found.delay_sigma, _LEAST_DELAY):
-        late = "late" if found.delay > 0 else "early"
+        late, allowed = "late" if found.delay > 0 else "early", abs(found.delay)
+        delay, sigma = told_delay(found.delay, found.delay_sigma, config.delay_sigma)
         warnings.append(
-            f"fixes seem to be stamped {abs(found.delay):.2f} s {late} (± {found.delay_sigma:.2f} s), which was allowed for; "
-            f"correct the stamps, or set gnss.time_offset_s={config.time_offset_s - found.delay:.2f}{_or_lever(attached, found)}"
+            f"fixes seem to be stamped {abs(delay):.2f} s {late} (± {sigma:.2f} s), of which {allowed:.2f} s were allowed for; "
+            f"correct the stamps, or set gnss.time_offset_s={config.time_offset_s - delay:.2f}"
+            f"{_or_lever(attached, found, delay, sigma)}"
         )
     share = 1.0 - float(found.is_used.mean())
     if share > _MANY_GATED:
@@ -138,8 +140,18 @@ def _where_heights_jump(attached: AttachedFixes, found: Fit) -> str:
     )
 
 
-def _or_lever(attached: AttachedFixes, found: Fit) -> str:
-    """A word on the antenna where it may explain a delay: a shift of it, the same in the body's frame, that does at any speed.
+def told_delay(delay: float, sigma: float, before: float) -> tuple[float, float]:
+    """What fixes say of their delay by themselves, and its standard deviation, of a fit that knew it to be 0 ± `before` [s].
+
+    Information adds up: 1/σ² = 1/σ_told² + 1/σ_before², and delay/σ² = told/σ_told² + 0. A delay of the fit is drawn to zero, the
+    more so the less fixes know it; stamps that are corrected by it stay late.
+    """
+    of_fixes = 1.0 / sigma**2 - 1.0 / before**2
+    return (delay / (sigma**2 * of_fixes), 1.0 / math.sqrt(of_fixes)) if of_fixes > 0.0 else (delay, sigma)
+
+
+def _or_lever(attached: AttachedFixes, found: Fit, delay: float, sigma: float) -> str:
+    """A word on the antenna where it may explain a delay that fixes tell: a shift of it in the body's frame does at any speed.
 
     A delay is known by velocities, and beside an unknown antenna by what of them differs from their mean: its standard deviation
     grows by the ratio of the two.
@@ -149,8 +161,8 @@ def _or_lever(attached: AttachedFixes, found: Fit) -> str:
     mean = v_body.mean(axis=0)
     size, varying = np.linalg.norm(v_body, axis=1), np.linalg.norm(v_body - mean, axis=1)
     told_by = math.sqrt(float((varying**2).sum()) / max(float((size**2).sum()), 1e-12))
-    if abs(found.delay) * told_by > _SIGMAS * found.delay_sigma:
+    if abs(delay) * told_by > _SIGMAS * sigma:
         return ""
-    where = "back" if found.delay > 0 else "ahead"
-    metres = abs(found.delay) * float(np.linalg.norm(mean))
+    where = "back" if delay > 0 else "ahead"
+    metres = abs(delay) * float(np.linalg.norm(mean))
     return f"; an antenna {metres:.1f} m farther {where} than the lever arm says would look the same"

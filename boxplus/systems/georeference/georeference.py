@@ -143,7 +143,8 @@ def _start(
         if lag is not None and lag.start.share >= _EXPLAINS:
             raise _Refused(
                 f"the clock of the receiver is another one: {100 * lag.start.share:.0f} % of the fixes follow the odometry "
-                f"when {lag.offset_s:+.2f} s are added to their times; correct the stamps, or set gnss.time_offset_s"
+                f"when {lag.offset_s:+.2f} s are added to their times; correct the stamps, or set "
+                f"gnss.time_offset_s={config.time_offset_s + lag.offset_s:.2f}"
             )
         share = 0.0 if start is None else start.share
         raise _Refused(

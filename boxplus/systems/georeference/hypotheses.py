@@ -17,6 +17,8 @@ _BETTER = 0.1  # by which the cost of one reading must be below that of another 
 SWAPPED = "latitude and longitude are swapped"
 OFFSETS_S = (*(0.25 * k for k in range(1, 9)), 17.0, 18.0, 19.0)
 """Offsets of clocks that are tried; GPS time is 18 s ahead of UTC since 2017."""
+_FINER_S = 0.05  # a clock that is named is named to this
+_CLEARER = 0.9  # of the cost, for a finer offset than one of those
 _FITS = 0.5  # largest cost of a reading that explains the fixes
 
 
@@ -80,15 +82,23 @@ def other_clock(time_ns: NDArray[np.int64], p_level: Floats, p_enu: Floats, tole
     Args:
         time_ns: (N,) of the fixes; the others as in `find_start`.
     """
-    best: Lag | None = None
     seconds = (time_ns - time_ns[0]) * 1e-9
-    for offset in (*OFFSETS_S, *(-offset for offset in OFFSETS_S)):
-        inside = (seconds + offset >= 0.0) & (seconds + offset <= seconds[-1])
-        if inside.sum() < 0.5 * len(seconds):
-            continue
-        moved = np.column_stack([np.interp(seconds[inside] + offset, seconds, p_level[:, k]) for k in range(3)])
-        start = find_start(moved, p_enu[inside], tolerance[inside])
-        if start is not None and (best is None or start.cost < best.start.cost):
-            best = Lag(offset, start)
+
+    def best_of(offsets: tuple[float, ...]) -> Lag | None:
+        found: Lag | None = None
+        for offset in offsets:
+            inside = (seconds + offset >= 0.0) & (seconds + offset <= seconds[-1])
+            if inside.sum() < 0.5 * len(seconds):
+                continue
+            moved = np.column_stack([np.interp(seconds[inside] + offset, seconds, p_level[:, k]) for k in range(3)])
+            start = find_start(moved, p_enu[inside], tolerance[inside])
+            if start is not None and (found is None or start.cost < found.start.cost):
+                found = Lag(offset, start)
+        return found
+
+    best = best_of((*OFFSETS_S, *(-offset for offset in OFFSETS_S)))
     cost = 1.0 if given is None else given.cost
-    return best if best is not None and best.start.cost < min(cost - _BETTER, _FITS) else None
+    if best is None or best.start.cost >= min(cost - _BETTER, _FITS):
+        return None
+    finer = best_of(tuple(best.offset_s + k * _FINER_S for k in range(-9, 10) if k))
+    return finer if finer is not None and finer.start.cost < _CLEARER * best.start.cost else best

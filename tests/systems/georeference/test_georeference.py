@@ -17,7 +17,7 @@ from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.gnss import GnssConfig
 from boxplus.systems.georeference.attachment import AttachedFixes, attach
 from boxplus.systems.georeference.config import GeoreferenceConfig
-from boxplus.systems.georeference.doubts import contradiction_of, doubts_of, gated_stretches
+from boxplus.systems.georeference.doubts import contradiction_of, doubts_of, gated_stretches, told_delay
 from boxplus.systems.georeference.fit import Fit, level
 from boxplus.systems.georeference.georeference import Georeference, georeference
 from boxplus.systems.georeference.heights import height_jump
@@ -325,8 +325,30 @@ def test_stamps_that_are_late_are_doubted_and_allowed_for(laps: Drive, delay: fl
     assert result.fit is not None and 0.5 < result.fit.delay / delay < 1.1  # drawn to zero by what is known beforehand
     (warning,) = [text for text in result.warnings if "stamped" in text]
     assert ("late" in warning) == (delay > 0)
+    told = re.search(r"stamped ([\d.]+) s .*\(± ([\d.]+) s\).*gnss.time_offset_s=(-?[\d.]+)", warning)
+    assert told is not None and float(told[3]) == np.sign(-delay) * float(told[1])
+    assert abs(float(told[1]) - abs(delay)) < 3.0 * float(told[2]) < 0.25  # what is to be corrected is all of it
     corrected = found(laps, GOOD.model_copy(update={"delay_s": delay}), GeoreferenceConfig(time_offset_s=-delay))
     assert corrected.warnings == []
+
+
+@pytest.mark.parametrize(("delay", "before"), [(0.65, 0.0), (-1.4, 0.0), (1.9, -1.0), (18.4, 0.0), (18.0, -1.0)])
+def test_the_offset_that_is_named_for_another_clock_is_what_corrects_it(laps: Drive, delay: float, before: float) -> None:
+    late = RTK.model_copy(update={"delay_s": delay})
+    refusal = found(laps, late, GeoreferenceConfig(time_offset_s=before)).refusal
+    assert refusal is not None and "the clock of the receiver is another one" in refusal
+    named = re.search(r"set gnss.time_offset_s=(-?[\d.]+)$", refusal)
+    assert named is not None and float(named[1]) == pytest.approx(-delay, abs=0.06)
+    corrected = found(laps, late, GeoreferenceConfig(time_offset_s=float(named[1])))
+    assert corrected.refusal is None and laps.off(corrected).max() < 0.3
+
+
+def test_what_fixes_tell_of_a_delay_is_not_drawn_to_zero() -> None:
+    before, of_fixes, measured = 0.1, 0.06, 0.5
+    information = 1.0 / before**2 + 1.0 / of_fixes**2
+    fitted, sigma = measured / of_fixes**2 / information, information**-0.5
+    assert told_delay(fitted, sigma, before) == pytest.approx((measured, of_fixes))
+    assert told_delay(0.02, before, before) == (0.02, before)  # of fixes that tell nothing
 
 
 def test_an_antenna_elsewhere_is_named_where_speeds_do_not_tell_it_from_a_delay(laps: Drive) -> None:
