@@ -65,6 +65,8 @@ def lidar_imu(
         ):
             found = calibrate_lidar_imu(opened, options, show)
         _print_table(terminal, found.quantities)
+        for text in found.warnings:
+            terminal.warn(text)
         text = calibration_yaml(found, options, recording.name)
         if output is not None:
             _write(output, text)

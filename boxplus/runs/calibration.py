@@ -19,7 +19,8 @@ from boxplus.runs.run_loop import versions
 from boxplus.systems.lidar_inertial_agreement.agreement import compare_sensors, usable
 from boxplus.systems.lidar_inertial_agreement.calibration import ARM, OFFSET, SCALE, SLOPE, THETA, Calibration, calibrate
 from boxplus.systems.lidar_inertial_agreement.finding import Cause
-from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions, judges_rotation
+from boxplus.systems.lidar_inertial_agreement.hypotheses import contradictions, judges_rotation, scale_finding
+from boxplus.systems.lidar_inertial_agreement.lengths import SLOPE_FLOOR, slope_finding
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 
 _STRETCH_S, _STRETCHES = 8.0, 5
@@ -57,12 +58,14 @@ class LidarImuCalibration:
         lidar_time_offset_s: to add to the LiDAR's times as they are in the recording [s].
         quantities: the rows of the table.
         stretches: how many were used.
+        warnings: what of the recording is wrong that no mounting or clock mends, one sentence each.
     """
 
     estimate: Calibration
     lidar_time_offset_s: float
     quantities: list[Quantity]
     stretches: int
+    warnings: list[str]
 
     def determined(self, name: str) -> bool:
         """Whether the motion showed the quantity of this name."""
@@ -118,7 +121,8 @@ def calibrate_lidar_imu(
             "hold the platform in a room with walls and furniture, and turn it by 30 deg and more about all axes for 30 s",
         )
     given_s = 0.0 if options is None else options.lidar_time_offset_s
-    return LidarImuCalibration(estimate, given_s + estimate.offset_s, _quantities(estimate, given_s), len(used))
+    quantities = _quantities(estimate, given_s)
+    return LidarImuCalibration(estimate, given_s + estimate.offset_s, quantities, len(used), _wrong_scales(estimate, quantities))
 
 
 class QuantityFacts(BaseModel):
@@ -142,6 +146,7 @@ class LidarImuFacts(BaseModel):
     T_imu_lidar: list[list[float]] | None = Field(description="(4, 4): p_imu = T_imu_lidar p_lidar; null: not determined")
     stretches: int = Field(description="of the recording that were used")
     quantities: dict[str, QuantityFacts] = Field(description="R_imu_lidar row by row with sigmas about the IMU's axes [rad]; SI")
+    warnings: list[str] = Field(description="what of the recording is wrong that no mounting or clock mends")
 
 
 def calibration_facts(found: LidarImuCalibration) -> LidarImuFacts:
@@ -167,7 +172,19 @@ def calibration_facts(found: LidarImuCalibration) -> LidarImuFacts:
         T_imu_lidar=estimate.T_imu_lidar.tolist() if found.has_mounting else None,
         stretches=found.stretches,
         quantities=quantities,
+        warnings=found.warnings,
     )
+
+
+def _wrong_scales(found: Calibration, quantities: list[Quantity]) -> list[str]:
+    """Scales that are determined and wrong, by what is named wherever the sensors are compared."""
+    known = {quantity.name for quantity in quantities if quantity.determined}
+    slope_std = float(np.hypot(found.std[SLOPE], SLOPE_FLOOR))
+    findings = [
+        slope_finding(found.slope, slope_std) if "length_ratio" in known else None,
+        scale_finding(found.gyro_scale, float(found.std[SCALE])) if "gyro_scale" in known else None,
+    ]
+    return [f"{finding.text}; correct that and calibrate anew" for finding in findings if finding is not None]
 
 
 def _quantities(found: Calibration, given_s: float) -> list[Quantity]:
@@ -265,6 +282,7 @@ def calibration_yaml(calibration: LidarImuCalibration, options: RecordingOptions
             f"  extrinsic_rotation_sigma_deg: {rotation:.3f}",
             f"  extrinsic_translation_sigma: {translation:.4f}",
         ]
+    lines += [f"# WARNING: {text}" for text in calibration.warnings]
     lines.append("# found with, and not settings:")
     for quantity in calibration.quantities:
         kept = "" if quantity.determined else f"; NOT DETERMINED: {quantity.advice}"

@@ -24,6 +24,7 @@ from boxplus.simulation.motions.spline import SplineTrajectory
 from boxplus.simulation.motions.trajectories import START_NS
 from boxplus.simulation.scenarios import mounting
 from boxplus.simulation.worlds import worlds
+from boxplus.systems.lidar_inertial_agreement.hypotheses import scale_finding
 
 T_IMU_LIDAR = mounting(20.0, -35.0, 110.0, (0.12, -0.08, 0.15))
 LIDAR = SpinningLidar(channels=12, azimuth_steps=150)
@@ -50,6 +51,7 @@ def test_the_file_is_a_configuration(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["calibrate", "lidar-imu", str(path), "-o", str(file), "--min-range", "0.4", "--json"])
     assert result.exit_code == 0, result.output
     facts = json.loads(result.stdout)["run"]
+    assert facts["warnings"] == []
     assert all(quantity["determined"] and len(quantity["sigma"]) in (1, 3) for quantity in facts["quantities"].values())
     assert "known" in result.stderr and str(file) in result.stderr
     config = load_run_config(file)
@@ -71,6 +73,23 @@ def test_the_file_is_a_configuration(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_lengths_that_are_wrong_are_said_with_the_mounting_that_they_spoil(tmp_path: Path) -> None:
+    """They were a number beside others, all of them known, and the file went into every later run."""
+    path = write_recording(swung(), tmp_path / "swung", fault=faults.scale_points(1.15))
+    result = CliRunner().invoke(app, ["calibrate", "lidar-imu", str(path), "--quiet"])
+    assert result.exit_code == 0
+    said = "the points are not in metres, or the accelerometer's scale is wrong; correct that and calibrate anew"
+    assert said in " ".join(result.stderr.split())
+    assert "# WARNING: the LiDAR's accelerations are 1.1" in result.stdout and said in result.stdout
+
+
+def test_a_scale_of_the_gyroscope_is_named_beyond_what_any_has() -> None:
+    assert scale_finding(1.1, 0.001) is None and scale_finding(0.8, 0.06) is None
+    found = scale_finding(0.8, 0.01)
+    assert found is not None and found.cause == "gyro_scale" and "0.80 ± 0.01 times" in found.text
+
+
+@pytest.mark.slow
 def test_what_the_motion_does_not_show_is_not_written() -> None:
     found = calibrate_lidar_imu(as_recording(carried()))
     assert not found.has_mounting and calibration_facts(found).T_imu_lidar is None
@@ -82,7 +101,7 @@ def test_what_the_motion_does_not_show_is_not_written() -> None:
 def test_a_mounting_left_open_is_told_as_every_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It said "not written" below the name of the file that was."""
     file = tmp_path / "calibration.yaml"
-    found = SimpleNamespace(quantities=[], has_mounting=False)
+    found = SimpleNamespace(quantities=[], has_mounting=False, warnings=[])
     monkeypatch.setattr("boxplus.recordings.open_recording", lambda *_: nullcontext())
     monkeypatch.setattr("boxplus.runs.calibration.calibrate_lidar_imu", lambda *_: found)
     monkeypatch.setattr("boxplus.runs.calibration.calibration_yaml", lambda *_: "recording:\n")

@@ -119,7 +119,11 @@ def judges_scale(rotation: RotationFit) -> bool:
 
 def least_scale(rotation: RotationFit) -> float:
     """How far the gyroscope's scale is off at least where it is named."""
-    return float(max(_SCALE_OFF, 4.0 * rotation.scale_std))
+    return _least_scale(rotation.scale_std)
+
+
+def _least_scale(std: float) -> float:
+    return float(max(_SCALE_OFF, 4.0 * std))
 
 
 def judges_lengths(agreement: Agreement) -> bool:
@@ -291,11 +295,16 @@ def _of_turn(rotation: RotationFit, translation: TranslationFit, T_declared: NDA
 
 def _of_scale(rotation: RotationFit) -> Finding | None:
     # The noise of the LiDAR's rates makes a slope too small: where it counts, nothing is said.
-    if not judges_scale(rotation) or abs(rotation.scale - 1.0) < least_scale(rotation):
+    return scale_finding(rotation.scale, rotation.scale_std) if judges_scale(rotation) else None
+
+
+def scale_finding(scale: float, std: float) -> Finding | None:
+    """A gyroscope that turns by this factor farther than the LiDAR, known to `std`; None where it may be right."""
+    if abs(scale - 1.0) < _least_scale(std):
         return None
     return Finding(
         "gyro_scale",
-        f"the gyroscope turns {rotation.scale:.2f} ± {rotation.scale_std:.2f} times as far as the LiDAR: its scale is wrong, or "
+        f"the gyroscope turns {scale:.2f} ± {std:.2f} times as far as the LiDAR: its scale is wrong, or "
         "the times of one of them do not run at the right speed",
     )
 
