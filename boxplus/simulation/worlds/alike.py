@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from boxplus.simulation.worlds.world import Solid, World, box, rectangle
+from boxplus.simulation.worlds.worlds import house, pavements
 
 
 def car_park(columns: int = 10, rows: int = 7, spacing: float = 8.0, height: float = 2.8) -> World:
@@ -89,3 +90,21 @@ def parallel_corridors(
             for x in np.arange(-0.5 * length + 0.5 * door, 0.5 * length, door):
                 solids.append(box((x, k * spacing + side * (0.5 * width + 0.25), 0.5 * height), (door - 1.2, 0.5, height)))
     return World(solids, cell_m=2.0)
+
+
+def estates(apart: float = 180.0, pitch: float = 60.0, street: float = 18.0, seed: int = 0) -> World:
+    """Two estates of three by three blocks, house for house and car for car the same, the second one `apart` metres along x.
+
+    The middles of the first one's streets are the lines x, y = 0 and `pitch`; the ring of blocks around them is a part of it.
+    """
+    solids: list[Solid] = [rectangle((0.5 * (apart + pitch), 0.5 * pitch, 0.0), (apart + 500.0, 400.0), reflectivity=0.2)]
+    lot = (pitch - street) / 3.0
+    for begin in (0.0, apart):
+        random = np.random.Generator(np.random.PCG64([seed, 121]))
+        for i, j in np.ndindex(3, 3):
+            low = np.array([begin + (i - 1) * pitch, (j - 1) * pitch]) + 0.5 * street
+            for a, b in np.ndindex(3, 3):
+                if (a, b) != (1, 1):  # the yard in the middle is never seen
+                    solids += house(random, low + lot * np.array([a, b]), low + lot * np.array([a + 1, b + 1]))
+            solids += pavements(random, low, low + pitch - street, street)
+    return World(solids)

@@ -56,6 +56,9 @@ class SlamConfig(Settings):
     odometry_scale: float = Field(1.5, gt=0, description="factor of the odometry's standard deviations in that test")
     rival_distance: float = Field(1.5, gt=0, description="as good a fit this far away makes a loop ambiguous [m]")
     rival_fit: float = Field(0.95, gt=0, le=1, description="as good: with this share of the points that fit")
+    seam: float = Field(
+        0.35, gt=0, le=1, description="share of what stands that successive maps see through, from which on it is a slip; 1: none"
+    )
     gravity_sigma: float = Field(0.005, gt=0, description="standard deviation of the vertical of a local map [rad]")
 
     def without_gravity(self) -> SlamConfig:

@@ -29,6 +29,7 @@ from boxplus.systems.slam.odometry_chain import OdometryChain
 from boxplus.systems.slam.outcome import SlamOutcome
 from boxplus.systems.slam.proposals import Proposal, Proposer
 from boxplus.systems.slam.registration import Surface, surface_distance
+from boxplus.systems.slam.seam import Seams
 from boxplus.systems.slam.verification import verify
 
 Pair = tuple[int, int]
@@ -75,6 +76,7 @@ class Slam:
         self._proposer = Proposer(self.config)
         self._surfaces: dict[int, Surface] = {}
         self._rms: list[float] = []
+        self._seams = Seams(self.config)
         self._newest: LocalMap | None = None
         self._agreements: dict[Pair, bool] = {}  # of loops that stand, which do not change any more
         self._closed = 0  # maps that the last closing saw
@@ -98,6 +100,7 @@ class Slam:
             self._placed = np.concatenate([self._placed, np.zeros_like(self._placed)])
         self._placed[query] = self._predicted(query)
         self._rms.append(self._rms_of_odometry(query))
+        self._seams.add(local_map, self._surface(query), self._odometry)
         verified = [self._verified(query, proposal) for proposal in self._proposals(query)]
         looked_at = _without_contradictions(verified, self._odometry, self.config)
         first = len(self.loops)
@@ -113,7 +116,12 @@ class Slam:
 
     @property
     def doubt(self) -> str | None:
-        """A sentence where loops that pass every other test contradict the odometry; None where they do not."""
+        """A sentence where successive local maps contradict each other, or loops that pass every other test the odometry; None
+        where neither does."""
+        return "; ".join(text for text in (self._seams.doubt(self.loops), self._drift()) if text is not None) or None
+
+    def _drift(self) -> str | None:
+        """What loops say that are refused for the odometry alone."""
         near = [
             loop
             for loop in self.loops
