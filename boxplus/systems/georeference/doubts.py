@@ -21,6 +21,7 @@ _LONG = 0.1  # of all fixes, a stretch of gated ones that is more than multipath
 _LASTING = 30.0  # [s]
 _SIGMAS = 3.0
 _LEAST_DELAY = 0.03
+_ADDED = 0.85  # of the standard deviation that a delay had before, below which fixes have added something to it
 NOISY = 1.5
 _BENT = 4.0  # mean square of the odometry's errors, where 1 is what its covariance allows
 
@@ -84,9 +85,9 @@ def doubts_of(
         )
     if attached.hold is not None and attached.hold.lasts:
         warnings.append(attached.hold.text)
-    if abs(found.delay) > max(_SIGMAS * found.delay_sigma, _LEAST_DELAY):
+    delay, sigma = told_delay(found.delay, found.delay_sigma, config.delay_sigma)
+    if abs(delay) > max(_SIGMAS * sigma, _LEAST_DELAY):
         late, allowed = "late" if found.delay > 0 else "early", abs(found.delay)
-        delay, sigma = told_delay(found.delay, found.delay_sigma, config.delay_sigma)
         warnings.append(
             f"fixes seem to be stamped {abs(delay):.2f} s {late} (± {sigma:.2f} s), of which {allowed:.2f} s were allowed for; "
             f"correct the stamps, or set gnss.time_offset_s={config.time_offset_s - delay:.2f}"
@@ -144,10 +145,11 @@ def told_delay(delay: float, sigma: float, before: float) -> tuple[float, float]
     """What fixes say of their delay by themselves, and its standard deviation, of a fit that knew it to be 0 ± `before` [s].
 
     Information adds up: 1/σ² = 1/σ_told² + 1/σ_before², and delay/σ² = told/σ_told² + 0. A delay of the fit is drawn to zero, the
-    more so the less fixes know it; stamps that are corrected by it stay late.
+    more so the less fixes know it; stamps that are corrected by it stay late. Where they add hardly anything to what was known,
+    the delay of the fit stays.
     """
     of_fixes = 1.0 / sigma**2 - 1.0 / before**2
-    return (delay / (sigma**2 * of_fixes), 1.0 / math.sqrt(of_fixes)) if of_fixes > 0.0 else (delay, sigma)
+    return (delay / (sigma**2 * of_fixes), 1.0 / math.sqrt(of_fixes)) if sigma < _ADDED * before else (delay, sigma)
 
 
 def _or_lever(attached: AttachedFixes, found: Fit, delay: float, sigma: float) -> str:

@@ -2,7 +2,8 @@
 
 A receiver that holds its last position in a tunnel and a driver that sends a position again with a new stamp say the same: where
 the antenna was some time ago. Noise never repeats itself to the last digit, so that two equal positions are one measurement,
-unless they are rounded so coarsely that the antenna stays within a cell meanwhile.
+unless they are rounded so coarsely that the antenna stays within a cell meanwhile. An antenna that stands repeats its position
+as well, and goes on from there: where the next position is no farther on, it is the path that slid.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ HELD = "repeating the position before while the path goes on"
 _LEAST_M = 0.2  # of way: an antenna that stands may well have one position, and an odometry that stands drifts
 _LASTING_S = 5.0
 _CELLS = 2.0  # of what positions are rounded to, diagonally; noise may keep a position in its cell a little longer
+_WENT_ON = 0.5  # of the path's way since: a position that comes after a hold is as far on, where the antenna moved
+_FEWEST_DIGITS, _MOST_DIGITS = 1, 9
+_ROUNDED, _SAME_DEG = 0.95, 1e-12  # share of the positions, as many as are not odd ones; and what is the same angle
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +44,9 @@ class Hold:
     def text(self) -> str:
         """A sentence."""
         return (
-            f"the receiver repeated one position for {self.duration:.0f} s from {self.begin:.0f} s on, while the path went "
-            f"{self.metres:.0f} m away: these fixes are left out; a tunnel, a receiver or driver that hangs, or a path that "
-            "moves while the antenna stands"
+            f"the receiver repeated one position for {self.duration:.0f} s, from {self.begin:.0f} s after its first fix on, "
+            f"while the path went {self.metres:.0f} m away: these fixes are left out; a tunnel, a receiver or driver that "
+            "hangs, or a path that moves while the antenna stands"
         )
 
 
@@ -55,8 +59,14 @@ def held(lat_lon_alt: Floats, p: Floats) -> NDArray[np.bool_]:
     """
     if not len(p):
         return np.zeros(0, dtype=np.bool_)
-    way = np.linalg.norm(p - p[_first_of(lat_lon_alt)], axis=1)
-    return np.asarray(way > _LEAST_M + _CELLS * _cell_m(lat_lon_alt))
+    first = _first_of(lat_lon_alt)
+    way = np.linalg.norm(p - p[first], axis=1)
+    repeats = way > _LEAST_M + _CELLS * _cell_m(lat_lon_alt)
+    begins = np.flatnonzero(first == np.arange(len(first)))
+    following = np.append(begins[1:], -1)[np.searchsorted(begins, first)]  # the next other position; of the last one none
+    went_on = np.linalg.norm(_metres(lat_lon_alt[following] - lat_lon_alt[first], lat_lon_alt), axis=1)
+    stood = (following >= 0) & (went_on < _WENT_ON * np.linalg.norm(p[following] - p[first], axis=1))
+    return np.asarray(repeats & ~stood)
 
 
 def longest_hold(time_ns: NDArray[np.int64], lat_lon_alt: Floats, p: Floats, is_held: NDArray[np.bool_]) -> Hold | None:
@@ -77,8 +87,23 @@ def _first_of(lat_lon_alt: Floats) -> NDArray[np.intp]:
 
 
 def _cell_m(lat_lon_alt: Floats) -> float:
-    """Diagonal of the cells that positions are rounded to, by the smallest steps between them [m]."""
-    cosine = np.array([1.0, float(np.cos(np.radians(np.median(lat_lon_alt[:, 0]))))])
-    steps = [np.diff(np.unique(lat_lon_alt[:, axis])) for axis in range(2)]
-    smallest = np.array([step.min() if len(step) else 0.0 for step in steps])
-    return float(np.linalg.norm(np.radians(smallest) * cosine) * SEMI_MAJOR_M)
+    """Diagonal of the cells that positions are rounded to [m]."""
+    # Both axes are written alike; along one that the antenna does not move, as on a street due north, anything fits.
+    step = min(_step(lat_lon_alt[:, 0]), _step(lat_lon_alt[:, 1]))
+    return float(np.linalg.norm(_metres(np.full((1, 2), step), lat_lon_alt)))
+
+
+def _step(degrees: Floats) -> float:
+    """What angles (N,) are rounded to [°]: decimals of degrees or of minutes, or numbers of four bytes; 0 where to none."""
+    for digits in range(_FEWEST_DIGITS, _MOST_DIGITS + 1):
+        for parts in (10.0**digits, 60.0 * 10.0 ** (digits - 2)):
+            if np.mean(np.abs(degrees - np.round(degrees * parts) / parts) < _SAME_DEG) >= _ROUNDED:
+                return 1.0 / parts
+    short = degrees.astype(np.float32)
+    return float(np.spacing(np.abs(short).max())) if np.mean(short == degrees) >= _ROUNDED else 0.0
+
+
+def _metres(degrees: Floats, lat_lon_alt: Floats) -> Floats:
+    """Differences (N, 2 or more) of latitude and longitude [°] as north and east (N, 2) [m], near these positions."""
+    cosine = np.cos(np.radians(np.median(lat_lon_alt[:, 0])))
+    return np.asarray(np.radians(degrees[:, :2]) * np.array([1.0, cosine]) * SEMI_MAJOR_M)

@@ -23,7 +23,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.path import LidarPath
 from boxplus.systems.lidar_inertial_agreement.lidar_path.scan_pattern import recurs
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shifted_scans import cost_of, shifts_show, unmoved_map
 from boxplus.systems.lidar_inertial_agreement.lidar_path.shown_turns import shown_turns
-from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import fresh_surfaces_across, surfaces_across
+from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import SeenSurfaces
 
 _DETERMINED_M_S = 0.15  # standard deviation of the speed along an axis
 _SLOW_M_S, _SLOW_RAD_S = 0.03, 0.01
@@ -92,10 +92,10 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
     swings = (np.abs(p @ along) > 2.0 * near).any() or np.linalg.norm(turned @ shown, axis=1).max() > _SWING_RAD
     at_rest = bool(not swings and ((slow and rate < _SLOW_RAD_S) or (creeps and _fits_unmoved(path, scans, config))))
     open_axes = axes[:, ~seen].T
-    if at_rest and seen.any():  # noise may seem to show an axis: those it is known least along are asked first
-        facing = faces(path, scans, config, axes[:, seen].T)
-        hardly = int(np.argmax(facing)) if facing.any() else len(facing)
-        open_axes = axes[:, : len(open_axes) + hardly].T
+    if at_rest and seen.any():  # noise may seem to show an axis, and more of it than of one that is shown
+        shown = seen.copy()
+        shown[seen] = faces(path, scans, config, axes[:, seen].T)
+        open_axes = axes[:, ~shown].T
     if at_rest and len(open_axes) == 1 and len(last) == len(scans) and shifts_show(scans, open_axes[0], config):
         open_axes = open_axes[:0]
     return Rest(at_rest, open_axes, not_shown.T, speed, rate)
@@ -113,12 +113,12 @@ def faces(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, ax
         tree.insert(placed(voxel_filter(scan.p_lidar)[1], k), downsample=True)
     if not recurs(scans):
         some = np.unique(np.linspace(0, len(scans) - 1, _LOOKED_AT).round().astype(int))
-        points = np.concatenate([placed(voxel_filter(scans[k].p_lidar)[0], k) for k in some])
-        return np.array([fresh_surfaces_across(tree, points, axis) for axis in axes])
+        seen = SeenSurfaces(tree, np.concatenate([placed(voxel_filter(scans[k].p_lidar)[0], k) for k in some]))
+        return np.array([seen.face(axis) for axis in axes])
     p_lidar = voxel_filter(scans[-1].p_lidar)[0]
     information = PlaneMeasurement(p_lidar, tree, config, with_extrinsic=False).at(path.packed(-1), rematch=True)
-    points, sensor, ratio_along = placed(p_lidar, -1), path.p_path_lidar[-1], information.directions.ratio_along
-    return np.array([surfaces_across(tree, points, sensor, axis, ratio_along(axis)) for axis in axes])
+    seen, ratio_along = SeenSurfaces(tree, placed(p_lidar, -1)), information.directions.ratio_along
+    return np.array([seen.face_for_rings(path.p_path_lidar[-1], axis, ratio_along(axis)) for axis in axes])
 
 
 def _fits_unmoved(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig) -> bool:

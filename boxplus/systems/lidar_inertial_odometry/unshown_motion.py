@@ -19,7 +19,7 @@ from boxplus.filtering.degeneracy import PoseDirections, with_weak_axis
 from boxplus.filtering.iterated_update import Posterior
 from boxplus.filtering.nav_state import T_P, T_V
 from boxplus.maps.ikd_tree import IkdTree
-from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surfaces_across
+from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import SeenSurfaces
 
 _SPEED_M_S = 10.0  # standard deviation: what carries a LiDAR does 30 m/s at most
 _SCANS_BETWEEN_LOOKS = 5
@@ -87,11 +87,12 @@ class UnshownMotion:
             return
         tree = IkdTree(cell_size=map_cell, rebuild="inplace")
         tree.insert(p_world, downsample=True)
+        seen = SeenSurfaces(tree, p_world)
 
         def shown(axis: NDArray[np.float64]) -> bool:
             if abs(axis @ (p_world_imu - self._p_start)) < self._least_way_m:
                 return False
-            return surfaces_across(tree, p_world, p_world_imu, axis, directions.ratio_along(axis))
+            return seen.face_for_rings(p_world_imu, axis, directions.ratio_along(axis))
 
         self._axes = np.array([axis for axis in self._axes if not shown(axis)]).reshape(-1, 3)
 

@@ -4,7 +4,7 @@ On a road between rails and walls the points look the same from every place. A r
 them while the platform drives, well determined by their ripples, and no scan is weak. What does change are posts, bushes and
 signs, and they have one motion in common (`common_motion`). Where scans show a direction poorly, that motion is asked for: a
 start goes by it, and an estimate that has another one later is contradicted. Nothing passes in a bare tunnel: there it is asked
-whether any surface faces the way at all (`surfaces_across`), or the scans know of it by their own pattern only.
+whether any surface faces the way at all (`SeenSurfaces`), or the scans know of it by their own pattern only.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.changes.common_motion i
 from boxplus.systems.lidar_inertial_agreement.lidar_path.explained_scans import turning_through
 from boxplus.systems.lidar_inertial_agreement.lidar_path.path import Poses
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import Turning, middle_of
-from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import surfaces_across
+from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import SeenSurfaces
 from boxplus.systems.lidar_odometry.motion import MotionState
 
 Floats = NDArray[np.float64]
@@ -123,7 +123,7 @@ def _open_way(scan: Scan, state: MotionState, directions: PoseDirections, tree: 
         return None
     p_lidar = scan.p_lidar[:: -(-len(scan) // _POINTS)].astype(np.float64)
     p_world = p_lidar @ state.R_world_lidar.T + state.p_world_lidar
-    if surfaces_across(tree, p_world, state.p_world_lidar, axis, float(directions.ratios.min())):
+    if SeenSurfaces(tree, p_world).face_for_rings(state.p_world_lidar, axis, float(directions.ratios.min())):
         return None
     return (
         f"nothing that the LiDAR sees faces the way along {signed(axis, 2)} (in the world frame): what its scans say of it is "

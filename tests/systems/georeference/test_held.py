@@ -52,7 +52,7 @@ def test_a_receiver_that_hangs_is_named_and_no_jump(laps: Drive, duration: float
     assert laps.off(found).max() < 1.0
     said = [text for text in found.warnings if text.startswith("the receiver repeated one position")]
     assert len(said) == (duration > 5.0)
-    assert all(f"for {duration:.0f} s from 20 s on" in text for text in said)
+    assert all(f"for {duration:.0f} s, from 20 s after its first fix on" in text for text in said)
     assert not any("contradict" in text or "jump" in text for text in found.warnings)
 
 
@@ -72,7 +72,7 @@ def test_positions_that_are_rounded_are_not_repeated(digits: int, speed: float) 
 
 def test_what_counts_as_repeated() -> None:
     places: NDArray[np.float64] = np.array(
-        [[49.0, 8.0, 1.0], [49.0, 8.0, 1.0], [49.0, 8.0, 2.0], [49.0, 8.0, 2.0], [49.0000001, 8.0, 2.0], [49.0, 8.0, 2.0]]
+        [[49.0, 8.0, 1.0], [49.0, 8.0, 1.0], [49.0, 8.0, 2.0], [49.0, 8.0, 2.0], [49.0000852, 8.0, 2.0], [49.0, 8.0, 2.0]]
     )
     p = np.column_stack([[0.0, 0.1, 0.5, 9.0, 9.5, 10.0], np.zeros((6, 2))])
     # the second stands; heights do not matter; what is left and come back to is another measurement
@@ -81,3 +81,48 @@ def test_what_counts_as_repeated() -> None:
     assert hold is not None and (hold.begin, hold.duration, hold.metres) == (0.0, 12.0, 9.0) and hold.lasts
     assert held(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
     assert longest_hold(np.arange(6), places, p, np.zeros(6, dtype=np.bool_)) is None
+
+
+ROUTES = {"straight": [[0.0, 0.0], [400.0, 0.0]], "L": [[0.0, 0.0], [250.0, 0.0], [250.0, 200.0]]}
+
+
+@pytest.mark.parametrize("every", [2, 5])
+@pytest.mark.parametrize("speed", [1.5, 8.0])
+@pytest.mark.parametrize("route", ROUTES)
+def test_what_is_sent_again_is_told_on_a_way_that_never_comes_back(route: str, speed: float, every: int) -> None:
+    """Where every position is new the smallest step between them is the way, and not what they are rounded to."""
+    one = drive(ROUTES[route], 7, DriftConfig(speed=speed))
+    fixes = one.fixes(RTK)
+    again = fixes.lat_lon_alt[np.arange(len(fixes)) // every * every]
+    p = np.column_stack([np.interp(fixes.time_ns, one.time_ns, one.T_odo_imu[:, 4 + k]) for k in range(3)])
+    way = np.linalg.norm(p - p[np.arange(len(fixes)) // every * every], axis=1)
+    np.testing.assert_array_equal(held(again, p)[:-every], (way > 0.2)[:-every])
+    assert not held(fixes.lat_lon_alt, p).any()
+
+
+@pytest.mark.parametrize("step", [1e-5, 1e-4 / 60.0, 1e-3 / 60.0])
+def test_what_is_rounded_coarsely_is_not_held_and_one_odd_position_changes_nothing(step: float) -> None:
+    metres = np.linspace(0.0, 300.0, 600)
+    p = np.column_stack([metres, np.zeros((600, 2))])
+    exact = np.column_stack([48.2 + np.degrees(metres / 6_378_137.0), np.full(600, 11.6), np.zeros(600)])
+    rounded = np.round(exact / [step, step, 1.0]) * [step, step, 1.0]
+    assert not held(rounded, p).any()
+    rounded[300, 0] += 1e-9
+    assert not held(rounded, p).any()
+
+
+def test_an_antenna_that_stood_while_the_path_slid_is_where_it_was() -> None:
+    """It goes on from where it was: the path is wrong, not the fixes. One that hung comes back where the path is."""
+    seconds = np.arange(0.0, 60.0, 0.2)
+    stands = (seconds >= 20.0) & (seconds < 40.0)
+    metres = np.where(seconds < 20.0, seconds, np.where(stands, 20.0, seconds - 20.0))
+    slides = metres + np.clip(0.25 * (seconds - 20.0), 0.0, 5.0)
+    random = np.random.default_rng(3)
+    noise = np.where(stands[:, None], 0.0, 0.005 * random.normal(size=(len(seconds), 2)))
+    deg = np.degrees(1.0 / 6_378_137.0)
+    fixes = np.column_stack([48.2 + deg * (metres + noise[:, 0]), 11.6 + deg * noise[:, 1], np.zeros(len(seconds))])
+    assert not held(fixes, np.column_stack([slides, np.zeros((len(seconds), 2))])).any()
+    went_on = np.column_stack([seconds, np.zeros((len(seconds), 2))])
+    hung = np.where(stands[:, None], fixes[np.searchsorted(seconds, 20.0)], fixes)
+    hung[seconds >= 40.0, 0] += 20.0 * deg
+    assert held(hung, went_on)[(seconds > 20.6) & stands].all()

@@ -31,18 +31,18 @@ def recurs(scans: Sequence[Scan]) -> bool:
 
     Directions that recur lie on the earlier ones, and off them when both are turned against each other by half a degree; others
     lie as far from them either way. Asked of sensors that see one way only: among rings whose azimuths come as they like, and
-    points that were corrected for motion before, the difference gets lost.
+    points that were corrected for motion before, the difference gets lost, as it does of lines that are as close as their points.
 
     Args:
         scans: as they were measured, LiDAR frame.
     """
-    if len(scans) < 2 or any(len(scan) < _FEWEST for scan in scans[-_BEFORE - 1 :]) or not sees_one_way(scans[-1].p_lidar):
+    *before, asked = [_directions(scan) for scan in scans[-_BEFORE - 1 :]] or [np.zeros((0, 3))]
+    if not before or any(len(seen) < _FEWEST for seen in (*before, asked)) or not sees_one_way(scans[-1].p_lidar):
         return True
-    asked = _directions(scans[-1])
     asked = asked[:: -(-len(asked) // _POINTS)]
     turned = [asked @ so3.exp(angle * axis) for angle in _TURNS_RAD for axis in np.eye(3)]
-    for scan in scans[-_BEFORE - 1 : -1]:
-        tree = IkdTree(_directions(scan), cell_size=_CELL)
+    for seen in before:
+        tree = IkdTree(seen, cell_size=_CELL)
         as_it_is = _distance(tree, asked)
         if max(_distance(tree, other) for other in turned) > _FARTHER * as_it_is:
             return True

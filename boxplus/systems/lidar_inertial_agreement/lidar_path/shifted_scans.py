@@ -20,10 +20,10 @@ _APART_S = 0.55  # between the first ones and the last: less leaves slower motio
 _NEAR_M = 3.0  # what goes along with a LiDAR, a mast or who carries it, is nearer: it fits at rest whatever moves
 _SHIFTS_M = (0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8)  # less is for the registrations to see: a third of a metre a second
 _WORSE = 1.4  # times the cost; rings that lie askew on a smooth tunnel reach 1.3 at the least of these shifts
-# Share of the points that comes to lie beside its place: so much more for each metre of a shift, up to a quarter. Of a narrow
+# Share of the points that comes to lie beside its place: so much for each metre of a shift, up to that of 0.4 m. Of a narrow
 # view of a tunnel all lie on its wall, where nearly nothing costs anything: one in a hundred that a shift takes over the edge of
 # the view, or off what its curves showed of the wall a second before, makes it cost half as much again.
-_BESIDE_A_METRE, _BESIDE = 0.15, 0.25
+_BESIDE_A_METRE, _BESIDE = 0.15, 0.06
 
 
 def shifts_show(scans: Sequence[Scan], axis: NDArray[np.float64], config: RegistrationConfig) -> bool:

@@ -14,7 +14,7 @@ _NEAR_M = 1.5
 _ACROSS = 0.25  # squared cosine between a normal and an axis that it faces
 _ENOUGH_ACROSS, _SHARE_ACROSS = 2.5, 0.005  # points that face it, and their share of all
 # Where the information along the axis is not this many times that of noise: their share within so many metres.
-_TELLING, _NEAR_SHARE_ACROSS, _NEAR_SENSOR_M = 6.0, 0.02, 10.0
+_TELLING, _NEAR_SHARE_ACROSS, _NEAR_SENSOR_M = 7.5, 0.02, 10.0
 _FRESH_SHARE_ACROSS = 0.003  # of a pattern that does not recur
 
 
@@ -49,42 +49,44 @@ def surface_distances(
     return near, surface, distances, normals
 
 
-def surfaces_across(
-    tree: IkdTree, points: NDArray[np.float64], sensor: NDArray[np.float64], axis: NDArray[np.float64], ratio: float
-) -> bool:
-    """Whether surfaces face an axis and would show a motion along it.
-
-    Where walls, floor and ceiling of a smooth corridor meet, far rings span planes across it even through many neighbours, though
-    they say hardly more than noise. So either what the scan says must be much, or many of the surfaces must be near.
+class SeenSurfaces:
+    """The surfaces that points of scans lie on, and whether they face an axis and would show a motion along it.
 
     Args:
         tree: the map.
-        points: (N, 3) of a scan, in its frame [m].
-        sensor: (3,) where they were seen from.
-        axis: (3,) unit vector there.
-        ratio: how many times what noise would the scan says about a motion along it (`PoseDirections.ratio_along`).
+        points: (N, 3) of a scan, or of several, in its frame [m].
     """
-    across = _facing(tree, points, axis)
-    if ratio < _TELLING:
-        across = across[np.linalg.norm(points - sensor, axis=1) < _NEAR_SENSOR_M]
-    share = _SHARE_ACROSS if ratio > _TELLING else _NEAR_SHARE_ACROSS
-    return float(across.sum()) > max(_ENOUGH_ACROSS, share * len(points))
 
+    def __init__(self, tree: IkdTree, points: NDArray[np.float64]) -> None:
+        self._points = points
+        _, _, _, self._normals = surface_distances(tree, points)
 
-def fresh_surfaces_across(tree: IkdTree, points: NDArray[np.float64], axis: NDArray[np.float64]) -> bool:
-    """The same of a LiDAR whose pattern does not recur (`scan_pattern`): what it sees as a surface is one.
+    def face_for_rings(self, sensor: NDArray[np.float64], axis: NDArray[np.float64], ratio: float) -> bool:
+        """Whether they do, seen by a pattern that goes along with the sensor.
 
-    Along corridors and tunnels none of 3000 to 5000 points of such a sensor lies on a surface that faces the way; among trunks
-    ten metres off and more, 0.35 % and more do.
+        Where walls, floor and ceiling of a smooth corridor meet, far rings span planes across it even through many neighbours,
+        though they say hardly more than noise. So either what the scan says must be much, or many of the surfaces must be near.
 
-    Args:
-        tree: the map, of several scans. points: (N, 3) of some of them, in its frame [m]. axis: (3,) unit vector there.
-    """
-    return float(_facing(tree, points, axis).sum()) > max(_ENOUGH_ACROSS, _FRESH_SHARE_ACROSS * len(points))
+        Args:
+            sensor: (3,) where the points were seen from.
+            axis: (3,) unit vector in the frame of the map.
+            ratio: how many times what noise would the scan says about a motion along it (`PoseDirections.ratio_along`).
+        """
+        across = self._across(axis)
+        if ratio < _TELLING:
+            across = across[np.linalg.norm(self._points - sensor, axis=1) < _NEAR_SENSOR_M]
+        share = _SHARE_ACROSS if ratio > _TELLING else _NEAR_SHARE_ACROSS
+        return float(across.sum()) > max(_ENOUGH_ACROSS, share * len(self._points))
 
+    def face(self, axis: NDArray[np.float64]) -> bool:
+        """Whether they do along an axis (3,), seen by a pattern that does not recur (`scan_pattern`): a surface is one then.
 
-def _facing(tree: IkdTree, points: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How squarely (N,) the surfaces that points (N, 3) lie on face an axis: squared cosines, zero where they do not."""
-    _, _, _, normals = surface_distances(tree, points)
-    across = np.asarray((normals @ axis) ** 2)
-    return np.where(across > _ACROSS, across, 0.0)
+        Along corridors and tunnels none of 3000 to 5000 points of such a sensor lies on a surface that faces the way; among
+        trunks ten metres off and more, 0.35 % and more do.
+        """
+        return float(self._across(axis).sum()) > max(_ENOUGH_ACROSS, _FRESH_SHARE_ACROSS * len(self._points))
+
+    def _across(self, axis: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How squarely (N,) they face an axis: squared cosines, zero where they do not."""
+        across = np.asarray((self._normals @ axis) ** 2)
+        return np.where(across > _ACROSS, across, 0.0)

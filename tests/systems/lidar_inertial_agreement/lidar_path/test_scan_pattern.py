@@ -46,7 +46,7 @@ def test_rings_recur(channels: int) -> None:
     assert recurs(scans_of(SpinningLidar(channels=channels, azimuth_steps=360), 2.0))
 
 
-@pytest.mark.parametrize("lines", [16, 32, 64, 128])
+@pytest.mark.parametrize("lines", [16, 32, 64])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_narrow_view_that_is_drawn_line_by_line_recurs(lines: int, seed: int) -> None:
     assert recurs(frames(lines, 0.0002, seed))
@@ -61,4 +61,6 @@ def test_where_little_is_known_it_is_taken_to_recur() -> None:
     scans = scans_of(RosetteLidar(points_per_scan=10_000), 0.0)
     assert recurs(scans[:1]) and recurs([])
     few = Scan.from_arrays(scans[0].p_lidar[:150], scans[0].time_ns[:150])
-    assert recurs([few, *scans[1:]]) and recurs([*scans[:3], few])
+    assert recurs([few, *scans[1:3]]) and recurs([*scans[:3], few])
+    here = Scan.from_arrays(0.001 * scans[0].p_lidar, scans[0].time_ns)  # all at the sensor itself
+    assert recurs([here, *scans[1:3]]) and recurs([*scans[:3], here])
