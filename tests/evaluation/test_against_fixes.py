@@ -86,7 +86,9 @@ def test_positions_that_a_receiver_repeats_are_no_error_of_the_trajectory() -> N
         )
         assert found.horizontal.max < 1.0
         assert found.rejected == {HELD: int((hangs != rows).sum())} and found.unmatched == 0
-        assert any("repeated one position for 10 s, from 10 s after its first fix on" in text for text in found.warnings) == is_said
+        assert (
+            any("repeated one position for 10 s, from 10 s after its first fix on" in text for text in found.warnings) == is_said
+        )
     with pytest.raises(InputError, match="it hangs"):
         compare_with_fixes(
             trajectory(time_ns, T), replace(fixes, lat_lon_alt=np.repeat(fixes.lat_lon_alt[:1], len(fixes), axis=0))

@@ -26,6 +26,7 @@ from boxplus.systems.lidar_inertial_odometry.mounted_update import MountedUpdate
 from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import T_imu_lidar_of
 from boxplus.systems.lidar_inertial_odometry.start.scan_span import span_problem
 from boxplus.systems.lidar_inertial_odometry.watches.corrections import Corrections
+from boxplus.systems.lidar_inertial_odometry.watches.pause import Pause
 from boxplus.systems.lidar_inertial_odometry.watches.steady_bias import SteadyBias
 from boxplus.systems.lidar_inertial_odometry.watches.stuck_sensor import StuckSensor
 
@@ -86,12 +87,14 @@ class Consistency:
         self._stuck = StuckSensor()
         self._corrected_from_ns: int | None = None
         self._told: set[str] = set()
+        self._pause = Pause()
 
     @property
     def contradiction(self) -> str | None:
         """What makes the estimate not to be trusted; a sentence."""
         found = self._watch.contradiction
-        return found.text if found is not None else self._innovation_text
+        text = found.text if found is not None else self._innovation_text
+        return None if text is None else self._pause.preface + text
 
     @property
     def mounting_borne_out(self) -> bool:
@@ -160,6 +163,7 @@ class Consistency:
         )
         if news is not None:
             warnings.append(news)
+        self._pause.update(frame, self.contradiction is not None)
         if self._unmatched == _LOST_STREAK:
             warnings.append(
                 f"only {matched_share:.0%} of the points fit the map, and too few in {_LOST_STREAK} scans in a row: the "

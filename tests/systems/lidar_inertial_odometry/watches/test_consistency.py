@@ -170,9 +170,8 @@ def test_whichever_sensor_turns_alone_raises_a_suspicion(by_gyroscope: float, by
         )
         begin_ns = number * PERIOD_NS
         imu = ImuSamples(begin_ns + time_ns, np.zeros((20, 3)), np.tile([0.0, 0.0, 9.81], (20, 1)))
-        frame: Any = SimpleNamespace(
-            scan=SimpleNamespace(start_ns=begin_ns, end_ns=begin_ns + PERIOD_NS), imu=imu, duration_s=0.1, largest_gap_s=0.005
-        )
+        scan = SimpleNamespace(start_ns=begin_ns, end_ns=begin_ns + PERIOD_NS)
+        frame: Any = SimpleNamespace(scan=scan, begin_ns=begin_ns, imu=imu, duration_s=0.1, largest_gap_s=0.005)
         posterior = SimpleNamespace(x=x, cov=cov, valid=True, last=SimpleNamespace(directions=directions))
         update: Any = SimpleNamespace(posterior=posterior, cov_prior=cov, cov=cov, B=B, B_prior=B)
         consistency.update(frame, x_before, x_prior, update, 1.0, 1.0)
