@@ -76,9 +76,8 @@ MORE: dict[str, Callable[[int], Drive]] = {
     "tunnel": lambda seed: (sites.tunnel(300.0), [[-100.0, 0.0], [100.0, 0.0]], _OUTDOORS),
     "smooth_corridor": lambda seed: (worlds.corridor(200.0), [[-80.0, 0.0], [80.0, 0.0]], _INDOORS),
 }
-ALL = [
-    name for name in (*MORE, *WORLDS) if "storeys" not in name and name != "long"
-]  # storeys alike are doubted whatever happens
+# Storeys alike are doubted whatever happens.
+ALL = [name for name in (*MORE, *WORLDS) if "storeys" not in name and name != "long"]
 
 
 def slipped(T_odo: NDArray[np.float64], slip: str, name: str, seed: int) -> tuple[NDArray[np.float64], str]:

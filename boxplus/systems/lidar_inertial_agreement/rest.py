@@ -82,23 +82,22 @@ def judge_rest(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfi
     speeds = (along.T @ b) / information[seen]
     ends = np.abs(along.T @ p[-min(3, len(p) - 1) :].mean(axis=0))
     turned = so3.log(path.R_path_lidar[last[0]].T @ path.R_path_lidar[last])
-    shown, not_shown = shown_turns(path)
-    rate = float(np.linalg.norm(shown.T @ turned[-1])) / float(seconds[-1])
+    shown_turn, not_shown_turn = shown_turns(path)
+    rate = float(np.linalg.norm(shown_turn.T @ turned[-1])) / float(seconds[-1])
     near = _NEAR_M + _DEVIATIONS * std[seen] * seconds[-1]
     slow = (np.abs(speeds) < _SLOW_M_S + _DEVIATIONS * std[seen]).all() and (ends < near).all()
     speed = float(np.linalg.norm(speeds))
     creeps = speed < _CREEP_M_S and rate < _CREEP_RAD_S
     # What swings to and fro may end as it began.
-    swings = (np.abs(p @ along) > 2.0 * near).any() or np.linalg.norm(turned @ shown, axis=1).max() > _SWING_RAD
+    swings = (np.abs(p @ along) > 2.0 * near).any() or np.linalg.norm(turned @ shown_turn, axis=1).max() > _SWING_RAD
     at_rest = bool(not swings and ((slow and rate < _SLOW_RAD_S) or (creeps and _fits_unmoved(path, scans, config))))
-    open_axes = axes[:, ~seen].T
+    shown = seen.copy()
     if at_rest and seen.any():  # noise may seem to show an axis, and more of it than of one that is shown
-        shown = seen.copy()
         shown[seen] = faces(path, scans, config, axes[:, seen].T)
-        open_axes = axes[:, ~shown].T
+    open_axes = axes[:, ~shown].T
     if at_rest and len(open_axes) == 1 and len(last) == len(scans) and shifts_show(scans, open_axes[0], config):
         open_axes = open_axes[:0]
-    return Rest(at_rest, open_axes, not_shown.T, speed, rate)
+    return Rest(at_rest, open_axes, not_shown_turn.T, speed, rate)
 
 
 def faces(path: LidarPath, scans: Sequence[Scan], config: RegistrationConfig, axes: NDArray[np.float64]) -> NDArray[np.bool_]:

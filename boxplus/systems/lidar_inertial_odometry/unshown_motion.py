@@ -85,16 +85,14 @@ class UnshownMotion:
         self._scans += 1
         if not len(self._axes) or self._scans % _SCANS_BETWEEN_LOOKS or directions is None:
             return
+        shown = np.abs(self._axes @ (p_world_imu - self._p_start)) >= self._least_way_m
+        if not shown.any():
+            return
         tree = IkdTree(cell_size=map_cell, rebuild="inplace")
         tree.insert(p_world, downsample=True)
         seen = SeenSurfaces(tree, p_world)
-
-        def shown(axis: NDArray[np.float64]) -> bool:
-            if abs(axis @ (p_world_imu - self._p_start)) < self._least_way_m:
-                return False
-            return seen.face_for_rings(p_world_imu, axis, directions.ratio_along(axis))
-
-        self._axes = np.array([axis for axis in self._axes if not shown(axis)]).reshape(-1, 3)
+        shown[shown] = [seen.face_for_rings(p_world_imu, axis, directions.ratio_along(axis)) for axis in self._axes[shown]]
+        self._axes = self._axes[~shown]
 
     def widened(self, cov: NDArray[np.float64], time_ns: int) -> NDArray[np.float64]:
         """A covariance at `time_ns`, of the tangent (24, 24) or of the pose (6, 6), with what the filter does not know of."""

@@ -37,21 +37,27 @@ def standing_in_common(own: Surface, there: Surface, T_there_own: Floats, config
 
 def upright_points(surface: Surface, config: LocalMapRegistrationConfig) -> NDArray[np.float32]:
     """(N, 3) points of a map that stand, in its frame, of about 6,000 that are looked at."""
-    points = surface.points[:: max(len(surface.points) // _POINTS, 1)]
-    if not len(points):
-        return points
-    is_level = np.abs(plane_normals(points, surface, config)[:, 2]) > _LEVEL
-    return np.ascontiguousarray(points[_above_ground(points) & ~is_level])
+    return _that_stand(_some_of(surface), surface, config)
 
 
 def upright_where_seen(
     own: Surface, there: Surface, T_there_own: Floats, config: LocalMapRegistrationConfig
 ) -> NDArray[np.float32]:
     """(N, 3) points of a map that stand, in its frame, where the other one sees."""
-    points = own.points[:: max(len(own.points) // _POINTS, 1)]
+    points = _some_of(own)
     q = se3.act(T_there_own, points.astype(np.float64)).reshape(-1, 3)
-    points = points[np.linalg.norm(q[:, :2], axis=1) <= _sight(there)]
-    is_level = np.abs(plane_normals(points, own, config)[:, 2]) > _LEVEL
+    return _that_stand(points[np.linalg.norm(q[:, :2], axis=1) <= _sight(there)], own, config)
+
+
+def _some_of(surface: Surface) -> NDArray[np.float32]:
+    return surface.points[:: max(len(surface.points) // _POINTS, 1)]
+
+
+def _that_stand(points: NDArray[np.float32], surface: Surface, config: LocalMapRegistrationConfig) -> NDArray[np.float32]:
+    """Those of the points (N, 3) of a map that are above the ground and lie on no level plane of it."""
+    if not len(points):
+        return points
+    is_level = np.abs(plane_normals(points, surface, config)[:, 2]) > _LEVEL
     return np.asarray(points[_above_ground(points) & ~is_level])
 
 
@@ -68,8 +74,6 @@ def _sight(surface: Surface) -> float:
 
 def _above_ground(points: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Which points are higher than the lowest one near by."""
-    if not len(points):
-        return np.zeros(0, dtype=np.bool_)
     cell = np.floor(points[:, :2].astype(np.float64) / _CELL).astype(np.int64)
     cell -= cell.min(axis=0) - 1
     lowest = np.full(cell.max(axis=0) + 2, np.inf)

@@ -36,8 +36,10 @@ def recurs(scans: Sequence[Scan]) -> bool:
     Args:
         scans: as they were measured, LiDAR frame.
     """
-    *before, asked = [_directions(scan) for scan in scans[-_BEFORE - 1 :]] or [np.zeros((0, 3))]
-    if not before or any(len(seen) < _FEWEST for seen in (*before, asked)) or not sees_one_way(scans[-1].p_lidar):
+    if len(scans) < 2 or not sees_one_way(scans[-1].p_lidar):
+        return True
+    *before, asked = [_directions(scan) for scan in scans[-_BEFORE - 1 :]]
+    if any(len(seen) < _FEWEST for seen in (*before, asked)):
         return True
     asked = asked[:: -(-len(asked) // _POINTS)]
     turned = [asked @ so3.exp(angle * axis) for angle in _TURNS_RAD for axis in np.eye(3)]
