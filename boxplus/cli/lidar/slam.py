@@ -83,7 +83,7 @@ def slam(
 
     The odometry of 'boxplus lio', with its results in the folder odometry/, and beside it the places that were seen again:
     corrected trajectory and map, and every loop that was looked at in loops.csv and in the report. Exit codes: as 'boxplus lio',
-    and 3 also where loops that fit contradict the odometry.
+    and 3 also where the odometry slipped between local maps, or loops that fit contradict it.
     """
     from boxplus.runs.slam.config import load_slam_config
     from boxplus.runs.slam.loop_file import read_loop_decisions

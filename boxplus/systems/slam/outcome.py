@@ -20,7 +20,7 @@ class SlamOutcome:
     Attributes:
         correction: poses of the local maps before and after.
         loops: every loop that was looked at, with what spoke for and against it.
-        doubt: a sentence where loops contradict the odometry, see `Slam.doubt`.
+        doubt: a sentence where local maps or loops contradict the odometry, see `Slam.doubt`.
         drift_scale: factor of the odometry's covariances in the graph.
         T_world_map: (7,) the frame of `correction.T_map` in that of trajectory and map: another one where the map was laid onto
             the Earth, or set upright.

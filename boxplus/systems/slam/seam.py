@@ -7,6 +7,9 @@ in three ways: it has a surface there, and the point *fits*; it looked through t
 from map to map everything fits there as anywhere else. Behind a door or a corner little is seen of the map before, but nothing is
 seen through either.
 
+A slip tears both ways: each map sees through what stands in the other. What moved along and hid the world, a lorry beside the
+sensor, say, stands in one map alone and is seen through by the other one only, and nothing is seen through it.
+
 A slip in the middle of a local map leaves half of it fit the map before, and half the one after. So each map is also held against
 the next but one, between which the whole slip lies.
 
@@ -38,6 +41,7 @@ _REACH = 40.0  # m: beyond, a drift of milliradians moves a point out of its dir
 _SPLAT = 0.4  # m: surfaces have no holes for thin things to be seen through
 _THROUGH, _THROUGH_M = 0.8, 0.7  # a point is seen through that is nearer than this share of what is behind it, less so much
 _FEWEST = 60  # contradicted points
+_EITHER, _FEWEST_EITHER = 0.2, 10  # share and points of either map alone that the other one contradicts
 _STANDS_OUT, _OF_ONE_SLIP = 4.0, 5  # times the median share of a run, but for the pairs that one slip can tear
 _COLLAPSED = 0.4  # of what fits in the run's other pairs of that distance
 _KNOWN_M, _KNOWN_RAD = 0.5, 0.05  # standard deviations of the odometry between two maps beyond which it claims too little to slip
@@ -51,36 +55,52 @@ class Seam:
 
     Attributes:
         before, after: their numbers.
-        standing: points that stand in either of them, about 6,000 looked at.
-        fitting, contradicted: those of which the other one has a surface there, or saw through.
+        standing: points that stand in either of them, about 6,000 of each looked at.
+        fitting, contradicted: those of the later map and those of the earlier one that the other one has a surface at, or saw
+            through.
     """
 
     before: int
     after: int
     standing: int
-    fitting: int
-    contradicted: int
+    fitting: tuple[int, int]
+    contradicted: tuple[int, int]
+
+    @property
+    def told(self) -> int:
+        """Points that stand in either and the other one tells of."""
+        return sum(self.fitting) + sum(self.contradicted)
 
     @property
     def share(self) -> float:
         """Of what stands in either and the other one tells of, what it saw through."""
-        return self.contradicted / max(self.fitting + self.contradicted, 1)
+        return sum(self.contradicted) / max(self.told, 1)
+
+    @property
+    def is_mutual(self) -> bool:
+        """Whether each map sees through what stands in the other, as after a slip, rather than one of them alone."""
+        return all(
+            seen >= max(_FEWEST_EITHER, _EITHER * (seen + fitting))
+            for seen, fitting in zip(self.contradicted, self.fitting, strict=True)
+        )
 
     @property
     def fitting_share(self) -> float:
         """Of what stands in either, what the other one has too."""
-        return self.fitting / max(self.standing, 1)
+        return sum(self.fitting) / max(self.standing, 1)
+
+    def is_under(self, loop: Loop) -> bool:
+        """Whether a loop leads from before it to after it."""
+        return loop.place <= self.before and loop.query >= self.after
+
+    def is_apart(self, other: Seam) -> bool:
+        """Whether no map is of both: then they are two slips, if they are any."""
+        return other.before > self.after or other.after < self.before
 
     def is_borne_out(self, loops: Sequence[Loop]) -> bool:
         """Whether accepted loops across it say that the odometry is right all the same."""
         across = [
-            loop
-            for loop in loops
-            if loop.is_accepted
-            and loop.source != "forced"
-            and loop.measured == 6
-            and loop.place <= self.before
-            and loop.query >= self.after
+            loop for loop in loops if loop.is_accepted and loop.source != "forced" and loop.measured == 6 and self.is_under(loop)
         ]
         return min(len({loop.place for loop in across}), len({loop.query for loop in across})) >= _BEARING
 
@@ -119,16 +139,18 @@ class Seams:
 
     @property
     def torn(self) -> list[Seam]:
-        """Pairs that contradict each other, and hardly fit, beside the other pairs of the run.
+        """Pairs of which each contradicts the other, and that hardly fit, beside the other pairs of the run.
 
         Among leaves or in traffic much is seen through everywhere, and what does not move fits all the same.
         """
-        told = sorted(seam.share for seam in self.pairs if seam.fitting + seam.contradicted >= _FEWEST)
+        told = sorted(seam.share for seam in self.pairs if seam.told >= _FEWEST)
         others = told[:-_OF_ONE_SLIP]
         least = max(self._config.seam, _STANDS_OUT * float(np.median(others)) if others else 0.0)
-        suspects = [seam for seam in self.pairs if seam.contradicted >= _FEWEST and seam.share >= least]
+        suspects = [seam for seam in self.pairs if sum(seam.contradicted) >= _FEWEST and seam.share >= least]
         usual = {apart: self._usual_fit(apart, set(suspects)) for apart in range(1, _APART + 1)}
-        return [seam for seam in suspects if seam.fitting_share <= _COLLAPSED * usual[seam.after - seam.before]]
+        return [
+            seam for seam in suspects if seam.is_mutual and seam.fitting_share <= _COLLAPSED * usual[seam.after - seam.before]
+        ]
 
     def _usual_fit(self, apart: int, suspects: set[Seam]) -> float:
         """How much fits in the pairs of one distance that are not suspected; 0 where there are none."""
@@ -137,12 +159,12 @@ class Seams:
 
     def doubt(self, loops: Sequence[Loop]) -> str | None:
         """A sentence on where the odometry slipped; None where it did nowhere, or accepted loops across say otherwise."""
-        torn = [seam for seam in self.torn if not seam.is_borne_out(loops)]
+        torn = _not_borne_out(self.torn, loops)
         if not torn:
             return None
-        worst = max(torn, key=lambda seam: (seam.share, seam.contradicted))
+        worst = max(torn, key=lambda seam: (seam.share, seam.told))
         from_s, to_s = (1e-9 * (self._time_ns[number] - self._begin_ns) for number in (worst.before, worst.after))
-        elsewhere = sum(seam.before >= worst.after or seam.after <= worst.before for seam in torn)
+        elsewhere = sum(seam.is_apart(worst) for seam in torn)
         also = f", as it is in {counted(elsewhere, 'pair')} of maps elsewhere" if elsewhere else ""
         return (
             f"the odometry slipped between local maps {worst.before} and {worst.after}, {from_s:.0f} to {to_s:.0f} s after the "
@@ -201,4 +223,14 @@ def _seam(before: _Seen, after: _Seen, T_before_after: Floats, config: SlamConfi
     first = before.tells(after, T_before_after, config)
     second = after.tells(before, se3.inverse(T_before_after), config)
     standing = len(before.standing) + len(after.standing)
-    return Seam(before.number, after.number, standing, first[0] + second[0], first[1] + second[1])
+    return Seam(before.number, after.number, standing, (first[0], second[0]), (first[1], second[1]))
+
+
+def _not_borne_out(torn: list[Seam], loops: Sequence[Loop]) -> list[Seam]:
+    """Seams that loops do not bear out. One across two that are apart may hold two slips that cancel, and bears neither out."""
+    left = [
+        seam
+        for seam in torn
+        if not seam.is_borne_out([own for own in loops if not any(o.is_under(own) and o.is_apart(seam) for o in torn)])
+    ]
+    return left if len(left) == len(torn) else _not_borne_out(left, loops)

@@ -105,7 +105,24 @@ def test_things_that_move_leave_the_rest_to_fit() -> None:
     lorry = np.column_stack([random.uniform(-7.0, 7.0, 900), np.full(900, -3.0), random.uniform(-1.5, 2.0, 900)])
     parts = [np.concatenate([street(k), lorry.astype(np.float32)]) if k == 4 else street(k) for k in range(9)]
     seams = seams_of(chain(parts, [HERE] * 9), SlamConfig(seam=0.05))
-    assert max(seam.contradicted for seam in seams.pairs) > 100 and seams.torn == []
+    assert max(sum(seam.contradicted) for seam in seams.pairs) > 100 and seams.torn == []
+
+
+def alongside(seed: int) -> Points:
+    """Lorries on both sides for a whole map: nothing but them and the ground is seen."""
+    random = np.random.default_rng(seed)
+    parts = [np.column_stack([random.uniform(-20.0, 20.0, (6000, 2)), np.full(6000, -1.8)])]
+    for y in (2.5, -2.5):
+        parts.append(np.column_stack([random.uniform(-15.0, 15.0, 6000), np.full(6000, y), random.uniform(-1.7, 2.0, 6000)]))
+    return np.concatenate(parts).astype(np.float32)
+
+
+def test_what_moves_along_and_hides_the_rest_is_contradicted_one_way_only() -> None:
+    seams = seams_of(chain([alongside(k) if k == 4 else street(k) for k in range(9)], [HERE] * 9))
+    hidden = [seam for seam in seams.pairs if 4 in (seam.before, seam.after)]
+    usual = np.median([seam.fitting_share for seam in seams.pairs if seam not in hidden])
+    assert min(seam.share for seam in hidden) > 0.5 and max(seam.fitting_share for seam in hidden) < 0.2 * usual
+    assert {min(seam.contradicted) for seam in hidden} == {0} and seams.doubt([]) is None
 
 
 def test_what_lies_behind_a_wall_says_nothing() -> None:
@@ -131,7 +148,7 @@ def test_a_map_without_points_says_nothing() -> None:
 
 
 def test_accepted_loops_across_a_seam_bear_the_odometry_out() -> None:
-    seam = Seam(5, 7, 2000, 10, 300)
+    seam = Seam(5, 7, 2000, (4, 6), (100, 200))
     assert seam.share == pytest.approx(300 / 310)
     assert seam.is_borne_out([loop(4, 20), loop(5, 21)])
     for loops in (
@@ -149,6 +166,16 @@ def test_accepted_loops_across_a_seam_bear_the_odometry_out() -> None:
     assert seams.torn and seams.doubt([loop(0, 1), loop(0, 2)]) is not None  # of one place
     seams = seams_of(chain([street(k) for k in range(5)], [HERE, HERE, HERE, ASIDE, ASIDE]))
     assert seams.doubt([]) is not None and seams.doubt([loop(0, 4), loop(1, 5)]) is None
+
+
+def test_loops_across_two_seams_bear_neither_out_as_slips_may_cancel() -> None:
+    seams = seams_of(chain([street(k) for k in range(12)], [ASIDE if 4 <= k < 8 else HERE for k in range(12)]))
+    assert {(seam.before, seam.after) for seam in seams.torn} >= {(3, 4), (7, 8)}
+    round_both = [loop(0, 10), loop(1, 11)]
+    text = seams.doubt(round_both)
+    assert text is not None and "of maps elsewhere" in text
+    # One that is borne out by itself leaves the other one alone under the loops round both.
+    assert seams.doubt([*round_both, loop(4, 10), loop(5, 11)]) is None
 
 
 def slipped(drive: MappedDrive, first: int, by: Sequence[float]) -> list[LocalMap]:
