@@ -23,13 +23,13 @@ from slam_campaign import INDOORS, WORLDS
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.builder import LocalMapBuilder
 from boxplus.maps.local_maps.local_map import LocalMap
+from boxplus.maps.local_maps.registration import Surface
 from boxplus.simulation.drifting_drive import DriftConfig, simulate_drifting_drive
 from boxplus.simulation.worlds import sites, worlds
 from boxplus.simulation.worlds.alike import estates
 from boxplus.simulation.worlds.world import World, box
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.odometry_chain import OdometryChain
-from boxplus.systems.slam.registration import Surface
 from boxplus.systems.slam.seam import Seams
 from boxplus.systems.slam.slam import Slam
 

@@ -15,7 +15,7 @@ import yaml
 from pydantic import BaseModel
 
 from boxplus.maps.descriptors.config import DescriptorConfig
-from boxplus.maps.local_maps.config import LocalMapConfig
+from boxplus.maps.local_maps.config import LocalMapConfig, LocalMapRegistrationConfig
 from boxplus.recordings.cameras.options import CameraRecordingOptions
 from boxplus.recordings.options import RecordingOptions
 from boxplus.runs.lidar_inertial.config import MapConfig
@@ -26,7 +26,7 @@ from boxplus.simulation.worlds.worlds import city
 from boxplus.systems.georeference.config import GeoreferenceConfig
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.localization.config import LocalizationConfig
-from boxplus.systems.slam.config import LocalMapRegistrationConfig, SlamConfig
+from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.visual_inertial_odometry.config import VioConfig
 from tests.runs.sessions.runs import written_run
 from tests.small_problems import write_small_files

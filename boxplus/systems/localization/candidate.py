@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
+from boxplus.maps.local_maps.registration import Surface, approach, mean_distance, register
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.global_search import Guess, same_pose
 from boxplus.systems.localization.standing import seen_through, standing
-from boxplus.systems.slam.registration import Surface, approach, mean_distance, register
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from boxplus._settings import Settings
-from boxplus.systems.slam.config import LocalMapRegistrationConfig
+from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
 
 
 class LocalizationConfig(Settings):

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from boxplus._chi_square import chi_square_quantile
 from boxplus.manifolds import se3
+from boxplus.maps.local_maps.registration import Surface, refine
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.systems.localization.config import LocalizationConfig
 from boxplus.systems.localization.place_map import PlaceMap
 from boxplus.systems.localization.standing import seen_through, standing
 from boxplus.systems.slam.lengths import Lengths, compare_lengths
-from boxplus.systems.slam.registration import Surface, refine
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]

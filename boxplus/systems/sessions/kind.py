@@ -12,11 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from boxplus.manifolds import se3
+from boxplus.maps.local_maps.registration import mean_distance, register
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.other_alignments import difference, is_same, laid_over, nearest_pairs, spread
 from boxplus.systems.sessions.places import Places
 from boxplus.systems.slam.loop import Floats
-from boxplus.systems.slam.registration import mean_distance, register
 from boxplus.systems.slam.structure import upright_where_seen
 
 _FAR = 0.15  # m, that a point is off a plane at most

@@ -28,6 +28,7 @@ import numpy as np
 
 from boxplus._words import counted, either
 from boxplus.manifolds import se3
+from boxplus.maps.local_maps.registration import fitting_share, register
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.encounter import Encounter, Meeting
 from boxplus.systems.sessions.graph import JoinedGraph, join
@@ -39,7 +40,6 @@ from boxplus.systems.sessions.slip import slip_of
 from boxplus.systems.slam.consistency import agree, largest_clique
 from boxplus.systems.slam.loop import Floats, Loop
 from boxplus.systems.slam.proposals import Proposal
-from boxplus.systems.slam.registration import fitting_share, register
 from boxplus.systems.slam.rivals import turned_rivals
 from boxplus.systems.slam.structure import standing_in_common
 from boxplus.systems.slam.verification import verify

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import quaternion, se3
+from boxplus.maps.local_maps.registration import Surface, facing_planes
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.places import Places
 from boxplus.systems.slam.loop import Floats, Loop
-from boxplus.systems.slam.registration import Surface, facing_planes
 
 _LEAST_TURN = np.sin(np.deg2rad(15.0)) ** 2  # of directions that are told from each other: nearer ones are left open alike
 _WORTH_OF_ONE = 0.99  # encounter that measures a direction, but for rounding

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
+from boxplus.maps.local_maps.registration import fitting_share, register
 from boxplus.systems.sessions.config import SessionsConfig
 from boxplus.systems.sessions.places import Places
 from boxplus.systems.slam.loop import Floats
-from boxplus.systems.slam.registration import fitting_share, register
 from boxplus.systems.slam.rivals import rival_shifts, turned_rivals
 
 _AGREEMENT = 0.6  # of density images, against that of the alignment found, for another one to be tried

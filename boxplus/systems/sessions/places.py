@@ -9,10 +9,10 @@ from boxplus.manifolds import se3
 from boxplus.maps.descriptors.features import Features
 from boxplus.maps.descriptors.place_index import PlaceIndex
 from boxplus.maps.descriptors.scan_context import ScanContext, ScanContextIndex, scan_context
+from boxplus.maps.local_maps.registration import Surface, surface_distance
 from boxplus.systems.sessions.session import Session
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.proposals import Proposal, described, seen, turned
-from boxplus.systems.slam.registration import Surface, surface_distance
 
 _KEPT_SURFACES = 48  # trees over local maps are built again where they are older
 _CONTEXTS = 3  # places looked at that have a similar scan context

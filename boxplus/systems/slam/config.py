@@ -8,21 +8,7 @@ from pydantic import Field
 
 from boxplus._settings import Settings
 from boxplus.maps.descriptors.config import DescriptorConfig
-
-
-class LocalMapRegistrationConfig(Settings):
-    """How two local maps are laid over each other, and what their covariance is made of."""
-
-    thickness: float = Field(0.15, gt=0, description="a plane's points lie within this of it [m]")
-    near: float = Field(0.5, gt=0, description="a point overlaps with a map that has one within this [m]")
-    cluster: float = Field(4.0, gt=0, description="side of the cells within which residuals may be correlated fully [m]")
-    inflation: float = Field(2.0, gt=0, description="factor of the covariance, from simulated worlds")
-    floor_rotation: float = Field(5e-4, ge=0, description="smallest standard deviation of a rotation [rad]")
-    floor_position: float = Field(0.01, ge=0, description="smallest standard deviation of a position [m]")
-    weak_information: float = Field(0.01, ge=0, description="a direction with less information per point is not measured")
-    weak_sigma: float = Field(0.3, gt=0, description="nor one with a larger standard deviation [m at the points]")
-    open_sigma: float = Field(2.0, gt=0, description="standard deviation stated for what was not measured [m at the points]")
-    threads: int = Field(1, ge=1, description="the result does not depend on it")
+from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
 
 
 class SlamConfig(Settings):

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.manifolds import quaternion, se3
-from boxplus.systems.slam.config import LocalMapRegistrationConfig
-from boxplus.systems.slam.registration import (
+from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
+from boxplus.maps.local_maps.registration import (
     FEWEST_ON_PLANES,
     LEAST_RESIDUAL_SCALE,
     NOISE,

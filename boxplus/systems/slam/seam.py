@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 from boxplus._words import counted
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.local_map import LocalMap
+from boxplus.maps.local_maps.registration import Surface, planes_beside, register
 from boxplus.maps.local_maps.visibility import directions, nearest_ranges
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.loop import Floats, Loop
 from boxplus.systems.slam.odometry_chain import RelativePoses
-from boxplus.systems.slam.registration import Surface, planes_beside, register
 from boxplus.systems.slam.structure import upright_points
 
 _APART = 2  # numbers of maps that are held against each other: neighbours, and the next but one

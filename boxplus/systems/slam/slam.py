@@ -20,6 +20,7 @@ from boxplus._arguments import as_settings
 from boxplus.errors import InputError
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.local_map import LocalMap
+from boxplus.maps.local_maps.registration import Surface, surface_distance
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.consistency import agree, largest_clique
 from boxplus.systems.slam.correction import Correction
@@ -28,7 +29,6 @@ from boxplus.systems.slam.loop import Floats, Loop
 from boxplus.systems.slam.odometry_chain import OdometryChain
 from boxplus.systems.slam.outcome import SlamOutcome
 from boxplus.systems.slam.proposals import Proposal, Proposer
-from boxplus.systems.slam.registration import Surface, surface_distance
 from boxplus.systems.slam.seam import Seams
 from boxplus.systems.slam.verification import verify
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from boxplus.manifolds import se3
-from boxplus.systems.slam.config import LocalMapRegistrationConfig
-from boxplus.systems.slam.registration import Surface, plane_normals
+from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
+from boxplus.maps.local_maps.registration import Surface, plane_normals
 
 Floats = NDArray[np.float64]
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from boxplus._chi_square import chi_square_quantile
 from boxplus.manifolds import quaternion, se3
 from boxplus.maps.local_maps.local_map import LocalMap
+from boxplus.maps.local_maps.registration import Registration, Surface, fitting_share, register
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.loop import Loop
 from boxplus.systems.slam.odometry_chain import RelativePoses, mahalanobis
 from boxplus.systems.slam.proposals import Proposal
-from boxplus.systems.slam.registration import Registration, Surface, fitting_share, register
 from boxplus.systems.slam.rivals import rival_shifts
 
 Floats = NDArray[np.float64]

@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
+from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
+from boxplus.maps.local_maps.registration import Surface, refine
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.simulation.worlds.world import World, box
 from boxplus.simulation.worlds.worlds import hall
 from boxplus.systems.localization.map_lengths import MapLengths
-from boxplus.systems.slam.config import LocalMapRegistrationConfig
 from boxplus.systems.slam.lengths import Lengths, compare_lengths
-from boxplus.systems.slam.registration import Surface, refine
 
 CONFIG = LocalMapRegistrationConfig()
 ROOM = World(

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.local_map import LocalMap
+from boxplus.maps.local_maps.registration import Surface
 from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.worlds.alike import estates
 from boxplus.simulation.worlds.worlds import city
 from boxplus.systems.slam.config import SlamConfig
 from boxplus.systems.slam.loop import Loop
 from boxplus.systems.slam.odometry_chain import OdometryChain
-from boxplus.systems.slam.registration import Surface
 from boxplus.systems.slam.seam import Seam, Seams
 from boxplus.systems.slam.slam import Slam
 from tests.systems.slam.drives import MappedDrive, mapped_drive

@@ -14,10 +14,10 @@ from boxplus.errors import InputError
 from boxplus.manifolds import quaternion, se3
 from boxplus.maps.local_maps.builder import LocalMapBuilder
 from boxplus.maps.local_maps.local_map import LocalMap
+from boxplus.maps.local_maps.registration import Surface, register
 from boxplus.simulation.drifting_drive import DriftConfig
 from boxplus.simulation.worlds.worlds import city
 from boxplus.systems.slam.config import SlamConfig
-from boxplus.systems.slam.registration import Surface, register
 from boxplus.systems.slam.slam import Pair, Slam
 from tests.systems.slam.drives import MappedDrive, ate, mapped_drive
 

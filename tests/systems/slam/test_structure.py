@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from boxplus.manifolds import se3
-from boxplus.systems.slam.config import LocalMapRegistrationConfig
-from boxplus.systems.slam.registration import Surface
+from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
+from boxplus.maps.local_maps.registration import Surface
 from boxplus.systems.slam.structure import standing_in_common
 
 CONFIG = LocalMapRegistrationConfig()

@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from boxplus.manifolds import se3
+from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
+from boxplus.maps.local_maps.registration import Surface, approach, register
 from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.simulation.worlds.world import World
 from boxplus.simulation.worlds.worlds import city, corridor, hall
-from boxplus.systems.slam.config import LocalMapRegistrationConfig
-from boxplus.systems.slam.registration import Surface, approach, register
 from boxplus.systems.slam.rivals import rival_shifts
 
 

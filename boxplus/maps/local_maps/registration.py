@@ -23,8 +23,8 @@ from boxplus._jit import kernel, run_chunks
 from boxplus.manifolds import quaternion, se3
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH, IkdView, copy_found, knn
 from boxplus.maps.ikd_tree.tree import IkdTree
+from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
 from boxplus.maps.plane_fit import fit_plane_into
-from boxplus.systems.slam.config import LocalMapRegistrationConfig
 
 Floats = NDArray[np.float64]
 
