@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.systems.slam.test_registration import pose, seen
 
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
 from boxplus.maps.local_maps.registration import Surface
 from boxplus.simulation.worlds.worlds import city, hall
 from boxplus.systems.slam.lengths import compare_lengths
+from tests.maps.local_maps.test_registration import pose, seen
 
 CONFIG = LocalMapRegistrationConfig()
 
