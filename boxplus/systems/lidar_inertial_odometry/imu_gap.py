@@ -33,3 +33,16 @@ def with_turn_rate(frame: Frame, rate: NDArray[np.float64], x: NDArray[np.float6
     gyro = imu.gyro.copy()
     gyro[imu.time_ns <= frame.begin_ns] = rate + x[BW : BW + 3]
     return ImuSamples(imu.time_ns, gyro, imu.accel)
+
+
+def imu_words(frame: Frame, max_gap_s: float) -> list[str]:
+    """What is said of a scan that the IMU does not cover: warnings of its estimate."""
+    words = []
+    if not frame.covered:
+        words.append("no IMU sample at or after the end of the scan: the last one was held")
+    if frame.largest_gap_s > max_gap_s:
+        words.append(
+            f"IMU gap of {frame.largest_gap_s:.2f} s, longer than {max_gap_s:g} s: motion taken from the LiDAR alone, covariance "
+            "widened"
+        )
+    return words

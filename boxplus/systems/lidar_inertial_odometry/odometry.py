@@ -28,7 +28,7 @@ from boxplus.sensors.sequencer import AFTER_GAP, BEFORE_START, Frame, Sequencer,
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import WAITED, Estimate, Prediction
-from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, mean_motion, with_turn_rate
+from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, imu_words, mean_motion, with_turn_rate
 from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
 from boxplus.systems.lidar_inertial_odometry.map_cell import map_cell_for
 from boxplus.systems.lidar_inertial_odometry.mounted_update import mounted_update
@@ -37,6 +37,7 @@ from boxplus.systems.lidar_inertial_odometry.mounting.mounting_drift import Moun
 from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import MOUNTING, UnknownMounting, mounting_known
 from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 from boxplus.systems.lidar_inertial_odometry.outcome import Outcome
+from boxplus.systems.lidar_inertial_odometry.resumption import GUESSED_S, after_pause, resumption
 from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start.first_scan import deskew_first
@@ -45,11 +46,12 @@ from boxplus.systems.lidar_inertial_odometry.start.start import Start
 from boxplus.systems.lidar_inertial_odometry.unshown_motion import UnshownMotion
 from boxplus.systems.lidar_inertial_odometry.watches.consistency import Consistency
 from boxplus.systems.lidar_inertial_odometry.watches.long_baseline import LongBaseline
+from boxplus.systems.lidar_inertial_odometry.watches.pause import is_pause
 from boxplus.systems.lidar_inertial_odometry.watches.weak_spell import WeakSpell
 from boxplus.systems.lidar_inertial_odometry.well_placed import well_placed
 
 _BLIND_PASSES, _BLIND_STRIDE, _BLIND_STEPS = 3, 8, 2
-_BLIND_WEIGHT = 0.01  # of the points' information: without the IMU they are corrected for motion to decimetres only
+_BLIND_WEIGHT = 0.01  # of the points' information, where they are corrected for motion to decimetres only
 _GAP_DENSITY = np.array([0.5**2, 3.0**2, 1e-4**2, 1e-3**2])  # nothing is known of the motion across a gap of the IMU
 _SATURATED_DENSITY = np.array([0.1**2, 1.0**2, 1e-4**2, 1e-3**2])  # what a clipped sample hides
 
@@ -90,6 +92,7 @@ class LidarInertialOdometry(Snapshots):
         self._warnings: list[str] = []
         self._x_before: NDArray[np.float64] = np.zeros(0)
         self._motion: NDArray[np.float64] = np.zeros((2, 3))  # turn rate and velocity over the last scan
+        self._guessed_ns = 0  # end of a scan after a pause: until the next one tells, its velocity is guessed
         self._one_way = False  # whether the LiDAR sees one way
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
@@ -167,6 +170,8 @@ class LidarInertialOdometry(Snapshots):
         for frame in frames:
             if self.start is not None and frame.duration_s > LONGEST_GAP_S:
                 frame = self._interrupt(frame)
+            elif self.start is not None and is_pause(frame):
+                frame = self._resume(frame)
             if self.start is not None:
                 estimates.append(self._process(frame))
                 continue
@@ -175,10 +180,26 @@ class LidarInertialOdometry(Snapshots):
                 estimates += self._try_start()
         return estimates
 
-    def _interrupt(self, frame: Frame) -> Frame:
+    def _resume(self, frame: Frame) -> Frame:
+        """After a pause of both sensors: from where its scan fits the map and nowhere else, or from a new start."""
+        self._consistency.pause.begin(frame)
+        x, cov, time_ns, begin = self._x.copy(), self._cov.copy(), self._time_ns, after_pause(frame)
+        self._time_ns = begin.begin_ns
+        p_lidar = self._voxel_filter(self._deskew(begin, self._noise.density)[0])[0]
+        again = resumption(x, self._x, p_lidar, self.map, frame)
+        self._x[:], self._cov[:], self._time_ns = x, cov, time_ns
+        if again.x is None:
+            return frame if frame.duration_s < GUESSED_S else self._interrupt(frame, again.text)
+        self._x[:], self._time_ns = again.x, begin.begin_ns
+        self._cov += np.diag(again.variances)
+        self._guessed_ns = frame.scan.end_ns
+        self._warnings.append(again.text)
+        return begin
+
+    def _interrupt(self, frame: Frame, why: str = "") -> Frame:
         """Nothing says how the platform moved since the last scan: back to the search for a start, with a new map."""
         self._consistency.finish()
-        self._gap = " ".join(filter(None, [self._gap, self._consistency.contradiction, gap_text(frame.duration_s)]))
+        self._gap = " ".join(filter(None, [self._gap, self._consistency.contradiction, gap_text(frame.duration_s, why)]))
         self._consistency, self._long_baseline = Consistency(self.config, live=self._live), LongBaseline(self.config)
         self.start, self._standstill = None, None
         self.map, self._arrivals = IkdTree(cell_size=self.config.map_cell), FirstArrivals(self.config.map_cell)
@@ -285,9 +306,9 @@ class LidarInertialOdometry(Snapshots):
         """Forward through the IMU samples to the end of the scan; every point is moved to that instant."""
         self._x_before = self._x.copy()
         saturated = dict.fromkeys(limit.text for limit in self._saturation.update(frame.imu))
-        self._warnings = [f"{text}: motion beyond it is not measured, covariance widened" for text in saturated]
+        self._warnings += [f"{text}: motion beyond it is not measured, covariance widened" for text in saturated]
         density = self._noise.update(frame.imu)
-        if self._warnings:
+        if saturated:
             density = np.maximum(density, _SATURATED_DENSITY)
         p_lidar, nodes = self._deskew(frame, density)
         self._time_ns = frame.scan.end_ns
@@ -303,27 +324,12 @@ class LidarInertialOdometry(Snapshots):
         return p_lidar, nodes
 
     def _carry(
-        self,
-        x: NDArray[np.float64],
-        cov: NDArray[np.float64],
-        imu: ImuSamples,
-        until_ns: int,
-        density: NDArray[np.float64],
+        self, x: NDArray[np.float64], cov: NDArray[np.float64], imu: ImuSamples, until_ns: int, density: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Propagate x (36,) and cov (24, 24) in place from the last posterior to `until_ns`; returns the nodes."""
         nodes = np.zeros((len(imu) + 3, NODE))
-        count = propagate_interval(
-            x,
-            cov,
-            (imu.time_ns - self._time_ns) * 1e-9,
-            imu.gyro,
-            imu.accel,
-            (until_ns - self._time_ns) * 1e-9,
-            density,
-            self.config.max_imu_gap,
-            _GAP_DENSITY,
-            nodes,
-        )
+        times, until, longest = (imu.time_ns - self._time_ns) * 1e-9, (until_ns - self._time_ns) * 1e-9, self.config.max_imu_gap
+        count = propagate_interval(x, cov, times, imu.gyro, imu.accel, until, density, longest, _GAP_DENSITY, nodes)
         return nodes[:count]
 
     def _slide_map(self) -> None:
@@ -347,7 +353,7 @@ class LidarInertialOdometry(Snapshots):
         )
 
     def _is_blind(self, frame: Frame) -> bool:
-        return frame.largest_gap_s > self.config.max_imu_gap
+        return frame.largest_gap_s > self.config.max_imu_gap or frame.begin_ns == self._guessed_ns
 
     def _is_astray(self, frame: Frame, on_map: float) -> bool:
         """Whether what fits the map may fit it by chance: after a gap of the IMU nothing but the points says where it is."""
@@ -368,13 +374,7 @@ class LidarInertialOdometry(Snapshots):
     ) -> Estimate:
         """What is said of a scan; without an outcome it is the first one, which is exact by definition."""
         warnings, self._warnings = self._warnings, []
-        if not frame.covered:
-            warnings.append("no IMU sample at or after the end of the scan: the last one was held")
-        if self._is_blind(frame):
-            warnings.append(
-                f"IMU gap of {frame.largest_gap_s:.2f} s, longer than {self.config.max_imu_gap:g} s: "
-                "motion taken from the LiDAR alone, covariance widened"
-            )
+        warnings += imu_words(frame, self.config.max_imu_gap)
         pose = self._unshown.widened(self._datum.pose_covariance(self._x), self._time_ns)
         return Estimate(
             time_ns=frame.scan.end_ns,

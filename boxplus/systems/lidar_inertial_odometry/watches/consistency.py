@@ -87,14 +87,14 @@ class Consistency:
         self._stuck = StuckSensor()
         self._corrected_from_ns: int | None = None
         self._told: set[str] = set()
-        self._pause = Pause()
+        self.pause = Pause()
 
     @property
     def contradiction(self) -> str | None:
         """What makes the estimate not to be trusted; a sentence."""
         found = self._watch.contradiction
         text = found.text if found is not None else self._innovation_text
-        return None if text is None else self._pause.preface + text
+        return None if text is None else self.pause.preface + text
 
     @property
     def mounting_borne_out(self) -> bool:
@@ -163,7 +163,7 @@ class Consistency:
         )
         if news is not None:
             warnings.append(news)
-        self._pause.update(frame, self.contradiction is not None)
+        self.pause.update(frame, self.contradiction is not None)
         if self._unmatched == _LOST_STREAK:
             warnings.append(
                 f"only {matched_share:.0%} of the points fit the map, and too few in {_LOST_STREAK} scans in a row: the "

@@ -8,8 +8,19 @@ from __future__ import annotations
 
 from boxplus.sensors.sequencer import Frame
 
-_LEAST_S = 0.25
+LEAST_S = 0.25  # nobody's sensors stutter for as long
 _SOON_S = 10.0  # after it; later, what is contradicted has other causes
+
+
+def without_scan_s(frame: Frame) -> float:
+    """From the end of the scan before to the beginning of this one [s]."""
+    return (frame.scan.start_ns - frame.begin_ns) * 1e-9
+
+
+def is_pause(frame: Frame) -> bool:
+    """Whether nothing told for a while how the platform moved, and both sensors go on."""
+    goes_on = bool(len(frame.imu) and frame.imu.time_ns[-1] > frame.scan.start_ns)
+    return min(frame.largest_gap_s, without_scan_s(frame)) > LEAST_S and goes_on
 
 
 class Pause:
@@ -30,11 +41,12 @@ class Pause:
         self._lasted_s = 0.0
         self._was_contradicted = False
 
+    def begin(self, frame: Frame) -> None:
+        """A scan comes after a pause."""
+        self._ended_ns, self._lasted_s = frame.scan.start_ns, without_scan_s(frame)
+
     def update(self, frame: Frame, contradicted: bool) -> None:
         """Take one scan in, and whether the run is contradicted now."""
-        without_scan_s = (frame.scan.start_ns - frame.begin_ns) * 1e-9
-        if min(frame.largest_gap_s, without_scan_s) > _LEAST_S:
-            self._ended_ns, self._lasted_s = frame.scan.start_ns, without_scan_s
         is_new, self._was_contradicted = contradicted and not self._was_contradicted, contradicted
         if is_new:
             self.preface = self._preface(frame.scan.end_ns)

@@ -1,0 +1,246 @@
+"""Where is a platform after a pause in which neither sensor told how it moved? Where its scan fits the map, if only there.
+
+Within half a second hands turn by 30 degrees, and a registration that begins so far off comes to rest beside the place. So many
+begin: along the arcs that turning by any angle makes of the way ahead, slower and faster, and beside them; those that fit best
+already are carried on. A place counts if its scan fits there far better than anywhere else that it may have got to
+(docs/lidar_inertial_odometry.md, "Pauses").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from boxplus.filtering.nav_state import T_P, T_THETA, T_V, TANGENT, G, NavState, P, R, V
+from boxplus.manifolds import quaternion, se3, so3
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
+from boxplus.maps.local_maps.registration import Surface, approach, mean_distance, refine
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.sequencer import Frame
+from boxplus.systems.lidar_inertial_odometry.watches.pause import LEAST_S
+
+Floats = NDArray[np.float64]
+Points = NDArray[np.float32]
+
+_TURN, _TURN_RATE, _TURNED = np.deg2rad([12.0, 120.0, 12.0])  # between starts; how fast one turns, and could have from the first
+_PUSHED = 8.0  # m/s²: wheels and legs push, brake and turn no harder
+_FASTER, _APART, _FAR = 1.4, 2.0, 0.5  # of the way ahead; m, between starts along it; m: of a shorter one none
+_STRAYED, _STRAYED_TURN = 3.0, np.deg2rad(25.0)  # m: a registration that goes farther has left where the platform may be
+_ASIDE, _FARTHEST = 1.0, 2.0  # m/s, m
+_GLANCED, _ROUGH, _POINTS = 300, 1000, 1500  # points for each start, each that is carried on, and each place
+_GLANCE, _CLOSE = 1.0, 0.3  # m, at which a point no longer fits
+_CARRIED, _LOOKED_AT = 24, 4
+_SAME_TURN, _SAME = np.deg2rad(5.0), 0.3  # m: nearer to each other than this two places are one
+_DISTANCE, _STEPS = 0.8, 15
+_ASTRAY = 0.5  # m, along what is open
+_FITS, _RMS = 0.13, 0.06  # m: mean distance, and spread of the points on planes, of a scan that lies where it belongs
+_CLEARLY = 1.3  # times worse any other place has to fit
+GUESSED_S = 0.75  # up to this long after the last scan its motion may be held
+_HELD_S = 1.0  # the same where the scan fits along a line: nobody turns round as fast
+_TURN_SIGMA, _SIGMA, _SPEED_SIGMA = 0.1, 0.3, 0.3  # rad, m, m/s: of the first state after a pause
+_PUSHED_ON = 1.0  # m/s²: what a motion that goes on as before may still do
+_SHORTEST = 0.5  # of the length of an arc, its chord
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where a scan fits.
+
+    Attributes:
+        T_world_imu: (7,) at the end of the scan.
+        distance: of its points from the planes of the map in the mean, none of which counts as more than 0.3 m [m].
+        rms: robust standard deviation of the points that lie on planes [m].
+        open: (k, 6) twists on the right of the pose, a metre at the points, that the surfaces leave open.
+    """
+
+    T_world_imu: Floats
+    distance: float
+    rms: float
+    open: Floats
+
+
+def places(p_imu: Points, tree: IkdTree, x: Floats, seconds: float) -> list[Place]:
+    """The places that fit best, best first: at most four, and those beside the best one where the surfaces leave it open.
+
+    Args:
+        p_imu: (N, 3) thinned points of a scan [m], as seen from the IMU at its end.
+        x: (36,) state before the pause, which ended so many `seconds` before that.
+    """
+    config, target = LocalMapRegistrationConfig(), Surface(np.zeros((0, 3), np.float32), tree)
+    glanced, rough, points = (_spread(p_imu, count) for count in (_GLANCED, _ROUGH, _POINTS))
+
+    def laid(T_start: Floats) -> list[Place]:
+        found = refine(points, target, T_start, config, distance=_DISTANCE, steps=_STEPS)
+        if found is None:
+            return []
+        T, lengths = found.T_target_source, np.repeat([found.lever_m, 1.0], 3)
+        return [Place(T, mean_distance(points, target, T, _CLOSE, config), found.rms, found.weak / lengths)]
+
+    starts = _starts(x, seconds)
+    fits = [mean_distance(glanced, target, T, _GLANCE, config) for T in starts]
+    source, carried = Surface(rough, tree), []
+    for k in np.argsort(fits, kind="stable")[:_CARRIED]:
+        T = approach(source, target, starts[k], config)
+        if T is not None and _within(T, starts[k], _STRAYED, _STRAYED_TURN):
+            carried.append((mean_distance(rough, target, T, _CLOSE, config), T))
+    carried.sort(key=lambda one: one[0])
+    found = [place for T in _distinct([T for _, T in carried])[:_LOOKED_AT] for place in laid(T)]
+    for best in sorted(found, key=lambda place: place.distance)[:1]:
+        asides = [se3.exp(sign * twist) for twist in best.open for sign in (-_ASTRAY, _ASTRAY)]
+        found += [place for aside in asides for place in laid(se3.compose(best.T_world_imu, aside))]
+    found.sort(key=lambda place: place.distance)
+    kept = _distinct([place.T_world_imu for place in found])
+    return [place for place in found if any(place.T_world_imu is T for T in kept)]
+
+
+def after_pause(frame: Frame) -> Frame:
+    """The frame without the pause: from the beginning of its scan, with the samples since then."""
+    imu = frame.imu
+    since = int(np.searchsorted(imu.time_ns, frame.scan.start_ns, side="right"))
+    if since and (frame.scan.start_ns - imu.time_ns[since - 1]) * 1e-9 < LEAST_S:
+        since -= 1
+    return replace(frame, imu=ImuSamples(imu.time_ns[since:], imu.gyro[since:], imu.accel[since:]), begin_ns=frame.scan.start_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Resumption:
+    """Where to go on.
+
+    Attributes:
+        x: (36,) state at the beginning of the scan; None where that is not known.
+        variances: (24,) to add to those of the state before the pause.
+        text: what is said of it; where it is not known, why, a clause.
+    """
+
+    x: Floats | None
+    variances: Floats
+    text: str
+
+
+def resumption(x: Floats, x_end: Floats, p_lidar: Points, tree: IkdTree, frame: Frame) -> Resumption:
+    """Where to go on after a pause.
+
+    Args:
+        x: (36,) state before it; x_end: what the IMU makes of it from the beginning of the scan to its end.
+        p_lidar: (N, 3) thinned points of the scan as seen from the LiDAR at its end [m].
+        frame: of the scan, with the pause.
+    """
+    state, seconds = NavState.unpack(x_end), frame.duration_s
+    p_imu = (p_lidar @ state.R_imu_lidar.T + state.p_imu_lidar).astype(np.float32)
+    found = places(p_imu, tree, x, seconds)
+    if not found or found[0].distance > _FITS or found[0].rms > _RMS:
+        return _nowhere("the scan after it fits the map at no place that the platform may have got to")
+    alike = [place for place in found if place.distance < _CLEARLY * found[0].distance]
+    alone = len(alike) == 1
+    place = found[0] if alone else _as_before(alike, x, seconds)
+    if place is None:
+        apart = np.linalg.norm(alike[1].T_world_imu[4:] - alike[0].T_world_imu[4:])
+        turned = np.rad2deg(_turned(alike[0].T_world_imu, alike[1].T_world_imu))
+        return _nowhere(f"the scan after it fits the map as well at places {apart:.1f} m and {turned:.0f} deg from each other")
+    again = _at_begin(place, x, x_end, seconds, (frame.scan.end_ns - frame.scan.start_ns) * 1e-9)
+    variances, sigma = np.zeros(TANGENT), _SIGMA if alone else _SIGMA + _PUSHED_ON * seconds**2
+    variances[T_THETA : T_THETA + 3], variances[T_P : T_P + 3] = _TURN_SIGMA**2, sigma**2
+    variances[T_V : T_V + 3] = (_SPEED_SIGMA + 2.0 * _PUSHED_ON * seconds) ** 2
+    return Resumption(again, variances, _found_text(again, x, seconds, alone=alone))
+
+
+def _nowhere(why: str) -> Resumption:
+    return Resumption(None, np.zeros(TANGENT), why)
+
+
+def _found_text(again: Floats, x: Floats, seconds: float, *, alone: bool) -> str:
+    moved = float(np.linalg.norm(again[P : P + 3] - x[P : P + 3]))
+    where = "at the one place where the scan fits the map"
+    if not alone:
+        where = "where it would be, had it gone on as before, of the places at which the scan fits the map as well as there"
+    return f"neither sensor told for {seconds:.1f} s how the platform moved: found again {moved:.1f} m from where it was, {where}"
+
+
+def _as_before(alike: Sequence[Place], x: Floats, seconds: float) -> Place | None:
+    """Of places that fit alike, as along a corridor, that of a platform that went on as before; None where that cannot tell."""
+    place = min(alike, key=lambda one: _off_arc(one, x, seconds))
+    told = seconds <= _HELD_S and _off_arc(place, x, seconds) <= _SIGMA + _PUSHED_ON * seconds**2
+    if not told or any(_turned(place.T_world_imu, other.T_world_imu) > _SAME_TURN for other in alike):
+        return None
+    return place
+
+
+def _off_arc(place: Place, x: Floats, seconds: float) -> float:
+    """How far a place lies from where a platform would be that turned as far and went on [m]."""
+    up = -x[G : G + 3] / np.linalg.norm(x[G : G + 3])
+    turn = float(up @ so3.log(quaternion.to_matrix(place.T_world_imu[:4]) @ x[R : R + 9].reshape(3, 3).T))
+    return float(np.linalg.norm(place.T_world_imu[4:] - x[P : P + 3] - _chord(x, turn, seconds)))
+
+
+def _chord(x: Floats, turn: float, seconds: float) -> Floats:
+    """(3,) way [m] over which a platform goes on from a state (36,) and turns by an angle about the vertical."""
+    up = -x[G : G + 3] / np.linalg.norm(x[G : G + 3])
+    chord: Floats = so3.exp(0.5 * turn * up) @ x[V : V + 3] * (seconds * np.sinc(0.5 * turn / np.pi))
+    return chord
+
+
+def _at_begin(place: Place, x: Floats, x_end: Floats, seconds: float, scan_s: float) -> Floats:
+    """(36,) state at the beginning of a scan that ends `seconds` after the state x, from the place where it ends.
+
+    Args:
+        x_end: (36,) what the IMU makes of x through the scan, which lasts `scan_s`.
+    """
+    again = x.copy()
+    R_before, R_turned = (of[R : R + 9].reshape(3, 3) for of in (x, x_end))
+    R_world_imu = quaternion.to_matrix(place.T_world_imu[:4]) @ R_turned.T @ R_before
+    up = -x[G : G + 3] / np.linalg.norm(x[G : G + 3])
+    turn = float(up @ so3.log(R_world_imu @ R_before.T))
+    chord = (place.T_world_imu[4:] - x[P : P + 3]) / (seconds * max(np.sinc(0.5 * turn / np.pi), _SHORTEST))
+    again[R : R + 9] = R_world_imu.ravel()
+    again[V : V + 3] = so3.exp(0.5 * turn * up) @ chord
+    again[P : P + 3] = place.T_world_imu[4:] - scan_s * again[V : V + 3]
+    return again
+
+
+def _starts(x: Floats, seconds: float) -> list[Floats]:
+    """T_world_imu (7,) that a platform may have got to since the state x (36,)."""
+    R_world_imu, p = x[R : R + 9].reshape(3, 3), x[P : P + 3]
+    up = -x[G : G + 3] / np.linalg.norm(x[G : G + 3])
+    across = np.linalg.qr(up[:, None], mode="complete")[0][:, 1:].T
+    speed = float(np.linalg.norm(x[V : V + 3]))
+    most = min(min(_TURN_RATE, _PUSHED / max(speed, 1e-3)) * seconds + _TURNED, math.pi)
+    way, slack = speed * seconds, 0.5 * _PUSHED * seconds**2
+    least, farthest = max(way - slack, 0.0), min(way + slack, _FASTER * way)
+    # At a quarter of a metre a second and less there is no way to speak of.
+    factors = np.linspace(least, farthest, 1 + math.ceil((farthest - least) / _APART)) / way if way > _FAR else np.ones(1)
+    beside = min(_ASIDE * seconds, _FARTHEST) * np.vstack([across, -across])
+    starts = []
+    for turn in np.linspace(-most, most, 2 * math.ceil(most / _TURN) + 1):
+        q = quaternion.from_matrix(so3.exp(turn * up) @ R_world_imu)
+        chord = _chord(x, turn, seconds)
+        starts += [np.concatenate([q, p + factor * chord]) for factor in factors]
+        starts += [np.concatenate([q, p + chord + offset]) for offset in beside]
+    return starts
+
+
+def _distinct(poses: Sequence[Floats]) -> list[Floats]:
+    """Of those (7,) that are near to each other the first."""
+    kept: list[Floats] = []
+    for T in poses:
+        if not any(_within(T, other, _SAME, _SAME_TURN) for other in kept):
+            kept.append(T)
+    return kept
+
+
+def _within(A: Floats, B: Floats, apart: float, turned: float) -> bool:
+    """Whether two poses (7,) are no farther from each other than this [m, rad]."""
+    return bool(np.linalg.norm(A[4:] - B[4:]) < apart and _turned(A, B) < turned)
+
+
+def _turned(A: Floats, B: Floats) -> float:
+    """The angle between two poses (7,) [rad]."""
+    return float(np.linalg.norm(se3.log(se3.compose(se3.inverse(A), B))[:3]))
+
+
+def _spread(points: Points, count: int) -> Points:
+    return np.ascontiguousarray(points[:: max(len(points) // count, 1)])

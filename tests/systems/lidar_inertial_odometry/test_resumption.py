@@ -1,0 +1,131 @@
+"""After a pause of both sensors: on from where the scan fits the map and nowhere else, or a new start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from boxplus.filtering.nav_state import NavState, P, R, V
+from boxplus.manifolds import so3
+from boxplus.maps.ikd_tree import IkdTree
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
+from boxplus.sensors.sequencer import Frame
+from boxplus.simulation import Simulation, simulate
+from boxplus.systems.lidar_inertial_odometry.odometry import LidarInertialOdometry
+from boxplus.systems.lidar_inertial_odometry.resumption import resumption
+from tests.systems.lidar_inertial_odometry.small_drives import config, run
+
+S = 1_000_000_000
+UP = np.array([0.0, 0.0, 1.0])
+SPEED = np.array([1.0, 0.2, 0.0])
+ROOM = ((-4.0, -3.0, 0.0), (5.0, 3.5, 2.6)), ((2.0, 1.2, 0.0), (2.8, 3.5, 1.5)), ((-4.0, -3.0, 0.0), (-2.8, -1.0, 0.9))
+OTHER_ROOM = ((-1.5, -6.0, 0.0), (1.5, 6.0, 3.5)), ((-1.5, 2.0, 0.0), (0.0, 2.6, 2.0))
+CORRIDOR = (((-60.0, -1.5, 0.0), (60.0, 1.5, 2.6)),)
+Boxes = tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
+
+
+def faces(boxes: Boxes, seed: int, density: float = 60.0) -> NDArray[np.float64]:
+    """Points on the faces of boxes, with a centimetre of noise."""
+    random, points = np.random.default_rng(seed), []
+    for low, high in (np.array(box) for box in boxes):
+        for axis in range(3):
+            others = [k for k in range(3) if k != axis]
+            for side in (low[axis], high[axis]):
+                face = np.empty((int(density * np.prod((high - low)[others])), 3))
+                face[:, others] = random.uniform(low[others], high[others], (len(face), 2))
+                face[:, axis] = side + random.normal(0.0, 0.01, len(face))
+                points.append(face)
+    return np.vstack(points)
+
+
+def state() -> NDArray[np.float64]:
+    """Before the pause, in the middle of the room."""
+    x = NavState.identity().pack()
+    x[P : P + 3], x[V : V + 3] = (0.0, 0.0, 1.2), SPEED
+    return x
+
+
+def resumed(boxes: Boxes, seen: Boxes, turn: float, moved: tuple[float, float], seconds: float = 1.0):
+    """What is made of a pause over which the platform turned by a yaw and moved."""
+    x = state()
+    R_world_imu, p = so3.exp(turn * UP), x[P : P + 3] + np.array([*moved, 0.0])
+    world = faces(seen, 2, 20.0)
+    world = world[np.linalg.norm(world - p, axis=1) < 15.0]
+    p_lidar = ((world - p) @ R_world_imu).astype(np.float32)
+    end = round(seconds * S)
+    scan = Scan(p_lidar, np.full(len(p_lidar), end), None, end - S // 10, end)
+    imu = ImuSamples(np.array([0, end]), np.zeros((2, 3)), np.zeros((2, 3)))
+    tree = IkdTree(faces(boxes, 1))
+    return resumption(x, x, p_lidar, tree, Frame(scan, imu, 0, True, seconds)), R_world_imu, p
+
+
+@settings(max_examples=20, deadline=None)
+@given(turn=st.floats(-1.5, 1.5), moved=st.tuples(st.floats(-0.5, 1.6), st.floats(-0.8, 1.0)))
+def test_it_is_found_where_it_is(turn: float, moved: tuple[float, float]) -> None:
+    again, R_world_imu, p = resumed(ROOM, ROOM, turn, moved)
+    assert again.x is not None, again.text
+    assert np.linalg.norm(so3.log(again.x[R : R + 9].reshape(3, 3).T @ R_world_imu)) < np.deg2rad(0.3)
+    assert np.linalg.norm(again.x[P : P + 3] + 0.1 * again.x[V : V + 3] - p) < 0.02  # at the end of the scan
+    assert "found again" in again.text
+
+
+def test_its_speed_is_that_of_an_arc() -> None:
+    turn, length = np.deg2rad(80.0), 1.5
+    chord = so3.exp(0.5 * turn * UP) @ (SPEED / np.linalg.norm(SPEED) * length * np.sinc(0.5 * turn / np.pi))
+    again, _, _ = resumed(ROOM, ROOM, turn, (float(chord[0]), float(chord[1])))
+    assert again.x is not None
+    along = so3.exp(turn * UP) @ (SPEED / np.linalg.norm(SPEED) * length)
+    np.testing.assert_allclose(again.x[V : V + 3], along, atol=0.05)
+
+
+@pytest.mark.parametrize("seconds", [0.6, 2.0])
+def test_along_a_corridor_it_is_where_it_would_be_and_after_seconds_nowhere(seconds: float) -> None:
+    again, _, p = resumed(CORRIDOR, CORRIDOR, 0.1, (1.02 * seconds, 0.2 * seconds), seconds)
+    if seconds > 1.0:
+        assert again.x is None
+        assert "as well at places" in again.text
+        return
+    assert again.x is not None, again.text
+    assert "had it gone on as before" in again.text
+    off = np.abs(again.x[P : P + 3] + 0.1 * again.x[V : V + 3] - p)
+    assert off[0] < np.sqrt(again.variances[3]) and off[1:].max() < 0.02
+
+
+def test_another_room_is_not_the_map() -> None:
+    again, _, _ = resumed(ROOM, OTHER_ROOM, 0.1, (0.5, 0.0))
+    assert again.x is None
+    assert "fits the map at no place" in again.text
+
+
+def with_pause(simulation: Simulation, begin_s: float, duration_s: float, until_s: float) -> Iterator[Scan | ImuSamples]:
+    begin, end, last = (simulation.start_ns + round(s * S) for s in (begin_s, begin_s + duration_s, until_s))
+    for event in simulation.events():
+        if isinstance(event, Scan):
+            if event.start_ns > last:
+                return
+            if event.end_ns <= begin or event.start_ns >= end:
+                yield event
+        elif (kept := (event.time_ns < begin) | (event.time_ns > end)).any():
+            yield ImuSamples(event.time_ns[kept], event.gyro[kept], event.accel[kept])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("duration_s", [0.3, 1.0, 3.0])
+def test_a_walk_goes_on_after_a_pause(duration_s: float) -> None:
+    simulation = simulate("walk")
+    odometry = LidarInertialOdometry(config(simulation))
+    estimates = run(odometry, with_pause(simulation, 24.5, duration_s, 24.5 + duration_s + 3.0))
+    truth = simulation.ground_truth(np.array([one.time_ns for one in estimates]))
+    R_map = estimates[0].state.R_world_imu @ truth.R_world_imu[0].T
+    away = np.array([one.state.p_world_imu - estimates[0].state.p_world_imu for one in estimates])
+    error = np.linalg.norm(away - (truth.p_world_imu - truth.p_world_imu[0]) @ R_map.T, axis=1)
+    assert error.max() < 0.08 and error[-1] < 0.02
+    assert odometry.contradiction is None
+    assert [one for one in estimates if any("found again" in text for text in one.warnings)]
+    assert all(one.status == "ok" for one in estimates)
