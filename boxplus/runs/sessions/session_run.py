@@ -14,7 +14,7 @@ from boxplus.formats.output import advice_to_put_back
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.manifolds import se3
 from boxplus.maps.local_maps.folder import LocalMapFolder
-from boxplus.runs.lidar_inertial.summary import read_summary
+from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.runs.sessions.repeated import RecordingIdentity
 from boxplus.runs.slam.folder import PROGRAM, SlamFolder
 from boxplus.runs.slam.graph_file import read_graph
@@ -35,14 +35,21 @@ class PlacedScan:
 
     Attributes:
         time_ns: absolute [ns].
-        origin: (3,) where its rays began; points: (N, 3) where they ended [m].
+        points: (N, 3) where its rays ended [m].
         intensity: (N,) or None.
+        p_lidars: (L, 3) where its LiDARs were; lidar: (N,) which of them saw each point, None where a single one is known to.
     """
 
     time_ns: int
-    origin: Floats
     points: Floats
     intensity: NDArray[np.float32] | None
+    p_lidars: Floats
+    lidar: NDArray[np.uint8] | None
+
+    @property
+    def origins(self) -> Floats:
+        """(N, 3) where its rays began."""
+        return self.p_lidars[np.zeros(len(self.points), np.uint8) if self.lidar is None else self.lidar]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +59,7 @@ class SessionRun:
     Attributes:
         folder: its output folder; session: what is aligned; correction: of its own loops.
         doubt: why the run itself is not to be trusted; None where nothing speaks against it.
-        p_imu_lidar: (3,) the LiDAR in the frame of the poses [m].
+        p_imu_lidars: (L, 3) its LiDARs in the frame of the poses, the first one first [m].
         identity: of its recording.
     """
 
@@ -60,7 +67,7 @@ class SessionRun:
     session: Session
     correction: Correction
     doubt: str | None
-    p_imu_lidar: Floats
+    p_imu_lidars: Floats
     identity: RecordingIdentity
 
     def placed(self, T_world_map: Floats) -> Correction:
@@ -77,10 +84,14 @@ class SessionRun:
         for scan in read_spool(self.folder.spool):
             T = placed.apply([scan.time_ns], scan.T_odo_body[None])[0]
             points = se3.act(T, scan.p_body.astype(np.float64)).reshape(-1, 3)
-            yield PlacedScan(scan.time_ns, se3.act(T, self.p_imu_lidar), points, scan.intensity)
+            yield PlacedScan(scan.time_ns, points, scan.intensity, se3.act(T, self.p_imu_lidars), scan.lidar)
 
     def stretches(self, T_world_map: Floats) -> Iterator[tuple[Floats, Floats]]:
-        """Origins and ends (n, 3) of the rays of each local map's stretch of way, in that world [m]."""
+        """Origins and ends (n, 3) of the rays of each local map's stretch of way, in that world [m].
+
+        Raises:
+            InputError: the file of scans is damaged; nobody knows from which of several LiDARs its rays came.
+        """
         ends_ns = np.array([local_map.end_ns for local_map in self.session.maps])
         number, origins, ends = 0, list[Floats](), list[Floats]()
         for scan in self.scans(T_world_map):
@@ -89,7 +100,13 @@ class SessionRun:
                 yield np.concatenate(origins), np.concatenate(ends)
                 origins, ends = [], []
             number = own
-            origins.append(np.broadcast_to(scan.origin, scan.points.shape))
+            if scan.lidar is None and len(self.p_imu_lidars) > 1:
+                raise InputError(
+                    f"scans that say which of the {len(self.p_imu_lidars)} LiDARs saw each point, as --remove-dynamic asks for",
+                    f"none in {self.folder.spool}, of an earlier version of boxplus",
+                    "run 'boxplus slam' again on the recording, or leave --remove-dynamic out",
+                )
+            origins.append(scan.origins)
             ends.append(scan.points)
         if ends:
             yield np.concatenate(origins), np.concatenate(ends)
@@ -133,11 +150,17 @@ def open_session_run(folder: str | Path, name: str, *, needs_scans: bool = True)
     if needs_scans:
         _refuse_cut_trajectory(own, max(local_map.end_ns for local_map in stored_maps))
     loops = [OwnLoop(loop.query, loop.place, loop.information) for loop in outcome.accepted]
-    extrinsic = odometry.extrinsic
-    T_imu_lidar = np.array(extrinsic.T_imu_lidar_end or extrinsic.T_imu_lidar_start)
     session = Session.of(name, maps, placed.T_map, loops)
     identity = RecordingIdentity.of(odometry, maps)
-    return SessionRun(own, session, placed, summary.contradiction, T_imu_lidar[:3, 3], identity)
+    return SessionRun(own, session, placed, summary.contradiction, _lidars(odometry), identity)
+
+
+def _lidars(odometry: RunSummary) -> Floats:
+    """(L, 3) where the LiDARs are in the frame of the poses [m]; all of them are held to the first one."""
+    extrinsic = odometry.extrinsic
+    T_imu_lidar = np.array(extrinsic.T_imu_lidar_end or extrinsic.T_imu_lidar_start)
+    T_lidar_others = [np.array(lidar.T_lidar_other) for lidar in odometry.lidars] or [np.eye(4)]
+    return np.array([(T_imu_lidar @ T)[:3, 3] for T in T_lidar_others])
 
 
 def _refuse_cut_trajectory(own: SlamFolder, end_ns: int) -> None:

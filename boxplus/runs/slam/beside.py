@@ -90,7 +90,7 @@ class Beside:
         up = -state.gravity_world if self._has_gravity else None
         made = self._builder.push(estimate.time_ns, T_odo_imu, 0.5 * (covariance + covariance.T), p_imu, up)
         if self._spool is not None and len(p_imu):
-            self._spool.append(SpooledScan(estimate.time_ns, T_odo_imu, p_imu, estimate.intensity))
+            self._spool.append(SpooledScan(estimate.time_ns, T_odo_imu, p_imu, estimate.intensity, estimate.lidar))
         self._take(made)
 
     def _take(self, made: Iterable[LocalMap]) -> None:

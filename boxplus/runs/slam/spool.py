@@ -1,7 +1,8 @@
 """Registered scans on disk, each with its pose along the odometry, to be placed where the closed loops put them.
 
-A record is a head, and the points that it counts, with or without intensities. The head ends with the checksum of the points and
-its own, so that a byte that changed on the disk is found wherever it is, and a damaged count is never believed.
+A record is a head, and the points that it counts, with or without intensities and the numbers of the LiDARs that saw them. The
+head ends with the checksum of the points and its own, so that a byte that changed on the disk is found wherever it is, and a
+damaged count is never believed.
 """
 
 from __future__ import annotations
@@ -22,18 +23,23 @@ from boxplus.formats.output import output_error
 from boxplus.manifolds import quaternion
 from boxplus.maps.tiles.voxel_thinning import RecentVoxels
 
-_HEAD = struct.Struct("<qqB7dI")  # time, points, whether with intensity, pose, CRC-32 of what follows the head
+_HEAD = struct.Struct("<qqB7dI")  # time, points, what comes with them (below), pose, CRC-32 of what follows the head
 _CHECK = struct.Struct("<I")  # CRC-32 of that, the end of the head
-_POINT, _INTENSITY = 12, 4  # bytes
+_POINT, _INTENSITY, _LIDAR = 12, 4, 1  # bytes
+_WITH_INTENSITY, _WITH_LIDAR = 1, 2
 
 
 class SpooledScan(NamedTuple):
-    """One scan: absolute time [ns], pose (7,) along the odometry, points (N, 3) in the body's frame [m], intensity (N,)."""
+    """One scan: absolute time [ns], pose (7,) along the odometry, points (N, 3) in the body's frame [m], intensity (N,).
+
+    `lidar` (N,) says which LiDAR saw each point, where several were merged.
+    """
 
     time_ns: int
     T_odo_body: NDArray[np.float64]
     p_body: NDArray[np.float32]
     intensity: NDArray[np.float32] | None
+    lidar: NDArray[np.uint8] | None = None
 
 
 class SpoolMark(NamedTuple):
@@ -75,8 +81,10 @@ class ScanSpool:
         data = points.tobytes()
         if scan.intensity is not None:
             data += np.ascontiguousarray(scan.intensity[keep], dtype=np.float32).tobytes()
-        has_intensity, pose = scan.intensity is not None, scan.T_odo_body.tolist()
-        head = _HEAD.pack(scan.time_ns, len(points), has_intensity, *pose, zlib.crc32(data))
+        if scan.lidar is not None:
+            data += np.ascontiguousarray(scan.lidar[keep], dtype=np.uint8).tobytes()
+        kinds = _WITH_INTENSITY * (scan.intensity is not None) | _WITH_LIDAR * (scan.lidar is not None)
+        head = _HEAD.pack(scan.time_ns, len(points), kinds, *scan.T_odo_body.tolist(), zlib.crc32(data))
         try:
             self._file.write(head + _CHECK.pack(zlib.crc32(head)) + data)
         except OSError as error:
@@ -171,6 +179,7 @@ class _Head(NamedTuple):
     time_ns: int
     points: int
     has_intensity: bool
+    has_lidar: bool
     T_odo_body: NDArray[np.float64]
     size: int
     checksum: int
@@ -190,11 +199,12 @@ def _next_head(file: BinaryIO) -> _Head | None:
     own = head[: _HEAD.size]
     if _CHECK.pack(zlib.crc32(own)) != head[_HEAD.size :]:
         raise ValueError(f"{_damaged(begin)} (or the file is of another version of boxplus)")
-    time_ns, count, has_intensity, *pose, checksum = _HEAD.unpack(own)
-    size = (_POINT + _INTENSITY * has_intensity) * count
+    time_ns, count, kinds, *pose, checksum = _HEAD.unpack(own)
+    has_intensity, has_lidar = bool(kinds & _WITH_INTENSITY), bool(kinds & _WITH_LIDAR)
+    size = (_POINT + _INTENSITY * has_intensity + _LIDAR * has_lidar) * count
     if size > os.fstat(file.fileno()).st_size - file.tell():
         raise ValueError(f"it ends within a scan that begins at byte {begin}")
-    return _Head(time_ns, count, bool(has_intensity), np.array(pose), size, checksum)
+    return _Head(time_ns, count, has_intensity, has_lidar, np.array(pose), size, checksum)
 
 
 def _next_scan(file: BinaryIO) -> SpooledScan | None:
@@ -210,8 +220,12 @@ def _next_scan(file: BinaryIO) -> SpooledScan | None:
     if zlib.crc32(data) != head.checksum:
         raise ValueError(_damaged(begin))
     points = np.frombuffer(data, dtype=np.float32, count=3 * head.points).reshape(-1, 3)
-    intensity = np.frombuffer(data, dtype=np.float32, offset=_POINT * head.points) if head.has_intensity else None
-    return SpooledScan(head.time_ns, head.T_odo_body, points, intensity)
+    intensity = lidar = None
+    if head.has_intensity:
+        intensity = np.frombuffer(data, dtype=np.float32, count=head.points, offset=_POINT * head.points)
+    if head.has_lidar:
+        lidar = np.frombuffer(data, dtype=np.uint8, offset=head.size - _LIDAR * head.points)
+    return SpooledScan(head.time_ns, head.T_odo_body, points, intensity, lidar)
 
 
 def _damaged(begin: int) -> str:

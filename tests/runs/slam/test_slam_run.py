@@ -259,7 +259,8 @@ def test_the_spool_gives_back_what_was_put_in_but_for_full_voxels(tmp_path: Path
     scans = []
     for k in range(3):
         points = random.uniform(-5.0, 5.0, (40, 3)).astype(np.float32)
-        scans.append(SpooledScan(k, pose, points, np.arange(40, dtype=np.float32) if k else None))
+        lidar = np.arange(40, dtype=np.uint8) if k % 2 == 0 else None  # alone, not at all, with intensities
+        scans.append(SpooledScan(k, pose, points, np.arange(40, dtype=np.float32) if k else None, lidar))
         spool.append(scans[-1])
     spool.append(scans[0])  # nothing of it is new
     spool.forget()
@@ -270,8 +271,10 @@ def test_the_spool_gives_back_what_was_put_in_but_for_full_voxels(tmp_path: Path
     for put, got, T in zip(scans, back, spool.poses()[1], strict=False):
         np.testing.assert_array_equal(got.T_odo_body, put.T_odo_body)
         np.testing.assert_array_equal(got.T_odo_body, T)
-        assert set(map(tuple, got.p_body.tolist())) <= set(map(tuple, put.p_body.tolist()))
-        assert (got.intensity is None) == (put.intensity is None)
+        rows = [put.p_body.tolist().index(point) for point in got.p_body.tolist()]
+        for found, given in ((got.intensity, put.intensity), (got.lidar, put.lidar)):
+            assert (found is None) == (given is None)
+            assert found is None or given is None or found.tolist() == given[rows].tolist()
     spool.close()
     assert [scan.time_ns for scan in read_spool(tmp_path / "spool")] == [0, 1, 2, 0, 0]
     (tmp_path / "spool").write_bytes((tmp_path / "spool").read_bytes()[:-5])
