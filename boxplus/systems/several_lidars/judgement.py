@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from boxplus.systems.several_lidars.motion import LidarMotion
 from boxplus.systems.several_lidars.pair import PairFit, fit_pair
+from boxplus.systems.several_lidars.readings import other_reading
 from boxplus.systems.several_lidars.surfaces import Surfaces
 
 Verdict = Literal["agree", "contradicted", "unverified"]
-Cause = Literal["", "pose", "inverted", "clock", "pose or clock", "pose and clock", "the same"]
+Cause = Literal["", "pose", "inverted", "clock", "pose or clock", "pose and clock", "unit", "the same"]
 
 _FLOOR = np.array([np.radians(0.2)] * 3 + [0.02] * 3 + [0.003])
 """Beside the covariance of a fit: what the surfaces and the first LiDAR's own path leave in error (rad, m, s)."""
@@ -59,7 +60,9 @@ def judge_pair(
     time_ns: NDArray[np.int64],
     T_declared: NDArray[np.float64],
 ) -> PairJudgement:
-    """Fit and judge; arguments as of `fit_pair`. Where what is declared leads nowhere, its inverse and other clocks are tried."""
+    """Fit and judge; arguments as of `fit_pair`. Where what is declared leads nowhere, its inverse and other clocks are tried,
+    then other readings of its points.
+    """
 
     def fit(T: NDArray[np.float64], offset_s: float = 0.0) -> PairFit | None:
         return fit_pair(motion, surfaces, p_other, time_ns, T_declared, T, offset_s)
@@ -75,9 +78,21 @@ def judge_pair(
                 best, cause = other, name
             if best is not None and best.fitting >= _GOOD_FITTING:
                 break
-    if best is None or best.near < _LEAST_NEAR:
-        return PairJudgement("unverified", "", "hardly any of its points lie near a surface that the first LiDAR saw meanwhile")
-    return _judged(best, inverted=cause == "inverted")
+    judgement = PairJudgement("unverified", "", "hardly any of its points lie near a surface that the first LiDAR saw meanwhile")
+    is_near = best is not None and best.near >= _LEAST_NEAR
+    if best is not None and is_near:
+        judgement = _judged(best, inverted=cause == "inverted")
+        if judgement.verdict != "contradicted" or best.fitting >= _GOOD_FITTING:
+            return judgement
+    read = other_reading(motion, surfaces, p_other, time_ns, T_declared, _SHOWN)
+    if read is None or (best is not None and _score(best) >= _score(read[1])):
+        return judgement
+    reading, found = read
+    nowhere = judgement.text if not is_near else "its points lie beside the surfaces that the first LiDAR saw"
+    text = f"{nowhere}, but {found.near:.0%} of them lie near one (and {found.fitting:.0%} of these on it) {reading.text}"
+    return PairJudgement(
+        "contradicted", reading.cause, text, T_first_other=found.T_first_other if reading.cause == "pose" else None
+    )
 
 
 def _score(fit: PairFit) -> float:

@@ -39,6 +39,7 @@ class _Other:
     windows: int = 0
     contradicted: int = 0
     streak: int = 0  # of windows in a row that contradict
+    is_seen: bool = False  # whether a point of it was ever merged
     last: PairJudgement | None = None
     agreed: PairJudgement | None = None  # of the windows that agree, that which shows most, the last of these
     contradicting: PairJudgement | None = None
@@ -85,6 +86,7 @@ class LidarWatch:
         for other in self._others:
             own = np.flatnonzero(scan.lidar == other.number)
             if len(own):
+                other.is_seen = True
                 own = own[:: -(-len(own) // _OTHER_POINTS)]
                 other.p_first.append(scan.p_lidar[own].astype(np.float64))
                 other.time_ns.append(scan.time_ns[own])
@@ -120,6 +122,12 @@ class LidarWatch:
             if other.streak and self.contradiction is None and 2 * other.contradicted >= other.windows:
                 told += self._contradict(other)
             if other.windows == 0:
+                if not other.is_seen:
+                    told.append(
+                        f"no point of LiDAR {other.name} was merged: none lies between min_range and max_range (another unit of "
+                        "length?) and in the time of a scan; see 'boxplus inspect'"
+                    )
+                    continue
                 why = "the recording is too short" if other.last is None else other.last.text
                 told.append(
                     f"LiDAR {other.name} could not be checked against the first one, and was merged as declared: {why}; see "

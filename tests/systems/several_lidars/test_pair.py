@@ -119,6 +119,42 @@ def test_an_inverted_pose_is_called_so() -> None:
     np.testing.assert_allclose(judgement.T_first_other, T, atol=0.02)
 
 
+UPSIDE_DOWN = pose((np.pi, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("turn", "factor", "cause", "says"),
+    [
+        (UPSIDE_DOWN, 1.0, "pose", "turned by 180 deg about"),
+        (pose((0.0, -np.pi / 2, 0.0), (0.0, 0.0, 0.0)), 1.0, "pose", "turned by 90 deg about (+0.00, -1.00, +0.00)"),
+        (np.eye(4), 1.0 / 0.3048, "unit", "once they are multiplied by 0.3048: they come in feet"),
+        (np.eye(4), 100.0, "unit", "once they are multiplied by 0.01: they come in centimetres"),
+    ],
+)
+def test_what_lies_nowhere_is_named_where_another_reading_fits(turn: Array, factor: float, cause: str, says: str) -> None:
+    """Once half of the map was upside down or in feet, with a warning that it could not be checked and exit code 0."""
+    motion, surfaces, p, time_ns = scene()
+    judgement = judge_pair(motion, surfaces, factor * p, time_ns, T_TRUE @ np.linalg.inv(turn))
+    assert (judgement.verdict, judgement.cause) == ("contradicted", cause), judgement.text
+    assert says in judgement.text
+    if cause == "pose":
+        assert judgement.T_first_other is not None
+        np.testing.assert_allclose(judgement.T_first_other, T_TRUE, atol=0.02)
+
+
+def test_another_reading_that_leaves_something_open_is_none() -> None:
+    """A floor alone lies on the ceiling once it is turned upside down."""
+    motion, _, _, _ = scene()
+    random = np.random.default_rng(5)
+    ceiling = np.column_stack([random.uniform(-9.0, 9.0, (20_000, 2)), np.full(20_000, 2.5)])
+    t = random.uniform(0.6, SECONDS - 0.6, 2000)
+    R, p, _, _ = motion.at(t)
+    floor = np.column_stack([random.uniform(-7.0, 7.0, (2000, 2)), np.full(2000, -2.5)])
+    p_other = np.einsum("nji,nj->ni", R, floor - p)
+    judgement = judge_pair(motion, Surfaces(ceiling), p_other, START_NS + (t * 1e9).astype(np.int64), np.eye(4))
+    assert judgement.verdict == "unverified", judgement.text
+
+
 def test_without_common_surfaces_nothing_is_claimed() -> None:
     motion, surfaces, p, time_ns = scene()
     judgement = judge_pair(motion, surfaces, p * 40.0, time_ns, T_TRUE)

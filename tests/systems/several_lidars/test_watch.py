@@ -84,6 +84,19 @@ def test_what_could_not_be_checked_is_said() -> None:
     assert len(told) == 1 and f"{REAR} could not be checked" in told[0]
 
 
+def test_a_lidar_without_a_point_in_range_is_not_called_too_short() -> None:
+    """As where it measures in millimetres, and max_range leaves all of it out."""
+    watch, told = LidarWatch([REAR], [T_IMU_REAR]), list[str]()
+    for event in simulation():
+        if isinstance(event, Scan):
+            alone = replace(event, lidar=np.zeros(len(event), np.uint8))
+            watch.add_scan(alone)
+            told += watch.add_estimate(estimate(alone))
+    told += watch.finish()
+    assert watch.contradiction is None
+    assert len(told) == 1 and f"no point of LiDAR {REAR} was merged" in told[0] and "unit of length" in told[0]
+
+
 def repeated(
     T: np.ndarray, every: int = 1, noise: float = 0.0, silent: int = 0, *, is_moved: bool = False
 ) -> tuple[LidarWatch, list[str]]:
