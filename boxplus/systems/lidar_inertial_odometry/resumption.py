@@ -19,7 +19,7 @@ from boxplus.filtering.nav_state import T_P, T_THETA, T_V, TANGENT, G, NavState,
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
-from boxplus.maps.local_maps.registration import Surface, approach, mean_distance, refine
+from boxplus.maps.local_maps.registration import Surface, approach, mean_distance, planes_beside, refine
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_odometry.watches.pause import LEAST_S
@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 _TURN, _TURN_RATE, _TURNED = np.deg2rad([12.0, 120.0, 12.0])  # between starts; how fast one turns, and could have from the first
-_PUSHED = 8.0  # m/s²: wheels and legs push, brake and turn no harder
+_PUSHED = 6.0  # m/s²: wheels and legs hardly ever push, brake and turn harder
 _FASTER, _APART, _FAR = 1.4, 2.0, 0.5  # of the way ahead; m, between starts along it; m: of a shorter one none
 _STRAYED, _STRAYED_TURN = 3.0, np.deg2rad(25.0)  # m: a registration that goes farther has left where the platform may be
 _ASIDE, _FARTHEST = 1.0, 2.0  # m/s, m
@@ -37,9 +37,10 @@ _GLANCE, _CLOSE = 1.0, 0.3  # m, at which a point no longer fits
 _CARRIED, _LOOKED_AT = 24, 4
 _SAME_TURN, _SAME = np.deg2rad(5.0), 0.3  # m: nearer to each other than this two places are one
 _DISTANCE, _STEPS = 0.8, 15
+_MAPPED, _LEAST_MAPPED = 2.0, 0.3  # m; share of the points
 _ASTRAY = 0.5  # m, along what is open
 _FITS, _RMS = 0.13, 0.06  # m: mean distance, and spread of the points on planes, of a scan that lies where it belongs
-_CLEARLY = 1.3  # times worse any other place has to fit
+_CLEARLY, _FLAT = 1.3, 0.02  # times worse any other place has to fit; m, of surfaces
 GUESSED_S = 0.75  # up to this long after the last scan its motion may be held
 _HELD_S = 1.0  # the same where the scan fits along a line: nobody turns round as fast
 _TURN_SIGMA, _SIGMA, _SPEED_SIGMA = 0.1, 0.3, 0.3  # rad, m, m/s: of the first state after a pause
@@ -56,20 +57,24 @@ class Place:
         distance: of its points from the planes of the map in the mean, none of which counts as more than 0.3 m [m].
         rms: robust standard deviation of the points that lie on planes [m].
         open: (k, 6) twists on the right of the pose, a metre at the points, that the surfaces leave open.
+        distances: (n,) of the points [m], of which `distance` is the mean.
+        mapped: (n,) whether the map has anything within 2 m of them.
     """
 
     T_world_imu: Floats
     distance: float
     rms: float
     open: Floats
+    distances: Floats
+    mapped: NDArray[np.bool_]
 
 
-def places(p_imu: Points, tree: IkdTree, x: Floats, seconds: float) -> list[Place]:
+def _places(p_imu: Points, tree: IkdTree, arcs: _Arcs) -> list[Place]:
     """The places that fit best, best first: at most four, and those beside the best one where the surfaces leave it open.
 
     Args:
         p_imu: (N, 3) thinned points of a scan [m], as seen from the IMU at its end.
-        x: (36,) state before the pause, which ended so many `seconds` before that.
+        arcs: from the state before the pause to that time.
     """
     config, target = LocalMapRegistrationConfig(), Surface(np.zeros((0, 3), np.float32), tree)
     glanced, rough, points = (_spread(p_imu, count) for count in (_GLANCED, _ROUGH, _POINTS))
@@ -79,9 +84,12 @@ def places(p_imu: Points, tree: IkdTree, x: Floats, seconds: float) -> list[Plac
         if found is None:
             return []
         T, lengths = found.T_target_source, np.repeat([found.lever_m, 1.0], 3)
-        return [Place(T, mean_distance(points, target, T, _CLOSE, config), found.rms, found.weak / lengths)]
+        planes, valid = planes_beside(points, target, T, _DISTANCE, config)
+        distances = np.where(valid, np.minimum(np.abs(planes[:, 3]), _CLOSE), _CLOSE)
+        mapped = tree.nearest(se3.act(T, points.astype(np.float64)), 1, max_distance=_MAPPED).counts > 0
+        return [Place(T, float(distances.mean()), found.rms, found.weak / lengths, distances, mapped)]
 
-    starts = _starts(x, seconds)
+    starts = arcs.starts()
     fits = [mean_distance(glanced, target, T, _GLANCE, config) for T in starts]
     source, carried = Surface(rough, tree), []
     for k in np.argsort(fits, kind="stable")[:_CARRIED]:
@@ -89,11 +97,11 @@ def places(p_imu: Points, tree: IkdTree, x: Floats, seconds: float) -> list[Plac
         if T is not None and _within(T, starts[k], _STRAYED, _STRAYED_TURN):
             carried.append((mean_distance(rough, target, T, _CLOSE, config), T))
     carried.sort(key=lambda one: one[0])
-    found = [place for T in _distinct([T for _, T in carried])[:_LOOKED_AT] for place in laid(T)]
+    found = [place for T in [*_distinct([T for _, T in carried])[:_LOOKED_AT], arcs.pose(0.0)] for place in laid(T)]
     for best in sorted(found, key=lambda place: place.distance)[:1]:
         asides = [se3.exp(sign * twist) for twist in best.open for sign in (-_ASTRAY, _ASTRAY)]
         found += [place for aside in asides for place in laid(se3.compose(best.T_world_imu, aside))]
-    found.sort(key=lambda place: place.distance)
+    found = sorted((place for place in found if arcs.is_near(place.T_world_imu)), key=lambda place: place.distance)
     kept = _distinct([place.T_world_imu for place in found])
     return [place for place in found if any(place.T_world_imu is T for T in kept)]
 
@@ -132,21 +140,34 @@ def resumption(x: Floats, x_end: Floats, p_lidar: Points, tree: IkdTree, frame: 
     """
     state, seconds = NavState.unpack(x_end), frame.duration_s
     p_imu = (p_lidar @ state.R_imu_lidar.T + state.p_imu_lidar).astype(np.float32)
-    found = places(p_imu, tree, x, seconds)
+    arcs = _Arcs(x, seconds)
+    found = _places(p_imu, tree, arcs)
     if not found or found[0].distance > _FITS or found[0].rms > _RMS:
         return _nowhere("the scan after it fits the map at no place that the platform may have got to")
-    alike = [place for place in found if place.distance < _CLEARLY * found[0].distance]
+    alike = [found[0], *(place for place in found[1:] if _fits_alike(found[0], place))]
     alone = len(alike) == 1
-    place = found[0] if alone else _as_before(alike, x, seconds)
+    place = found[0] if alone else _as_before(alike, arcs, seconds)
     if place is None:
         apart = np.linalg.norm(alike[1].T_world_imu[4:] - alike[0].T_world_imu[4:])
         turned = np.rad2deg(_turned(alike[0].T_world_imu, alike[1].T_world_imu))
         return _nowhere(f"the scan after it fits the map as well at places {apart:.1f} m and {turned:.0f} deg from each other")
-    again = _at_begin(place, x, x_end, seconds, (frame.scan.end_ns - frame.scan.start_ns) * 1e-9)
+    again = _at_begin(place, x, x_end, arcs, (frame.scan.end_ns - frame.scan.start_ns) * 1e-9)
     variances, sigma = np.zeros(TANGENT), _SIGMA if alone else _SIGMA + _PUSHED_ON * seconds**2
     variances[T_THETA : T_THETA + 3], variances[T_P : T_P + 3] = _TURN_SIGMA**2, sigma**2
     variances[T_V : T_V + 3] = (_SPEED_SIGMA + 2.0 * _PUSHED_ON * seconds) ** 2
     return Resumption(again, variances, _found_text(again, x, seconds, alone=alone))
+
+
+def _fits_alike(best: Place, other: Place) -> bool:
+    """Whether a scan fits as well at another place.
+
+    Where a tunnel lies ahead that nobody has seen yet, the scan fits better the farther back it is laid. Of places that the
+    platform slides between, only what lies where something is mapped at both tells.
+    """
+    both = best.mapped & other.mapped
+    if _turned(best.T_world_imu, other.T_world_imu) > _SAME_TURN or both.mean() < _LEAST_MAPPED:
+        both[:] = True
+    return float(other.distances[both].mean()) < _CLEARLY * max(float(best.distances[both].mean()), _FLAT)
 
 
 def _nowhere(why: str) -> Resumption:
@@ -161,66 +182,76 @@ def _found_text(again: Floats, x: Floats, seconds: float, *, alone: bool) -> str
     return f"neither sensor told for {seconds:.1f} s how the platform moved: found again {moved:.1f} m from where it was, {where}"
 
 
-def _as_before(alike: Sequence[Place], x: Floats, seconds: float) -> Place | None:
+def _as_before(alike: Sequence[Place], arcs: _Arcs, seconds: float) -> Place | None:
     """Of places that fit alike, as along a corridor, that of a platform that went on as before; None where that cannot tell."""
-    place = min(alike, key=lambda one: _off_arc(one, x, seconds))
-    told = seconds <= _HELD_S and _off_arc(place, x, seconds) <= _SIGMA + _PUSHED_ON * seconds**2
+    place = min(alike, key=lambda one: arcs.off(one.T_world_imu))
+    told = seconds <= _HELD_S and arcs.off(place.T_world_imu) <= _SIGMA + _PUSHED_ON * seconds**2
     if not told or any(_turned(place.T_world_imu, other.T_world_imu) > _SAME_TURN for other in alike):
         return None
     return place
 
 
-def _off_arc(place: Place, x: Floats, seconds: float) -> float:
-    """How far a place lies from where a platform would be that turned as far and went on [m]."""
-    up = -x[G : G + 3] / np.linalg.norm(x[G : G + 3])
-    turn = float(up @ so3.log(quaternion.to_matrix(place.T_world_imu[:4]) @ x[R : R + 9].reshape(3, 3).T))
-    return float(np.linalg.norm(place.T_world_imu[4:] - x[P : P + 3] - _chord(x, turn, seconds)))
-
-
-def _chord(x: Floats, turn: float, seconds: float) -> Floats:
-    """(3,) way [m] over which a platform goes on from a state (36,) and turns by an angle about the vertical."""
-    up = -x[G : G + 3] / np.linalg.norm(x[G : G + 3])
-    chord: Floats = so3.exp(0.5 * turn * up) @ x[V : V + 3] * (seconds * np.sinc(0.5 * turn / np.pi))
-    return chord
-
-
-def _at_begin(place: Place, x: Floats, x_end: Floats, seconds: float, scan_s: float) -> Floats:
-    """(36,) state at the beginning of a scan that ends `seconds` after the state x, from the place where it ends.
+def _at_begin(place: Place, x: Floats, x_end: Floats, arcs: _Arcs, scan_s: float) -> Floats:
+    """(36,) state at the beginning of a scan that ends at a place.
 
     Args:
-        x_end: (36,) what the IMU makes of x through the scan, which lasts `scan_s`.
+        x: (36,) before the pause; x_end: what the IMU makes of it through the scan, which lasts `scan_s`.
     """
-    again = x.copy()
-    R_before, R_turned = (of[R : R + 9].reshape(3, 3) for of in (x, x_end))
-    R_world_imu = quaternion.to_matrix(place.T_world_imu[:4]) @ R_turned.T @ R_before
-    up = -x[G : G + 3] / np.linalg.norm(x[G : G + 3])
-    turn = float(up @ so3.log(R_world_imu @ R_before.T))
-    chord = (place.T_world_imu[4:] - x[P : P + 3]) / (seconds * max(np.sinc(0.5 * turn / np.pi), _SHORTEST))
-    again[R : R + 9] = R_world_imu.ravel()
-    again[V : V + 3] = so3.exp(0.5 * turn * up) @ chord
+    again, R_turned = x.copy(), x[R : R + 9].reshape(3, 3).T @ x_end[R : R + 9].reshape(3, 3)
+    again[R : R + 9] = (quaternion.to_matrix(place.T_world_imu[:4]) @ R_turned.T).ravel()
+    again[V : V + 3] = arcs.speed(place.T_world_imu)
     again[P : P + 3] = place.T_world_imu[4:] - scan_s * again[V : V + 3]
     return again
 
 
-def _starts(x: Floats, seconds: float) -> list[Floats]:
-    """T_world_imu (7,) that a platform may have got to since the state x (36,)."""
-    R_world_imu, p = x[R : R + 9].reshape(3, 3), x[P : P + 3]
-    up = -x[G : G + 3] / np.linalg.norm(x[G : G + 3])
-    across = np.linalg.qr(up[:, None], mode="complete")[0][:, 1:].T
-    speed = float(np.linalg.norm(x[V : V + 3]))
-    most = min(min(_TURN_RATE, _PUSHED / max(speed, 1e-3)) * seconds + _TURNED, math.pi)
-    way, slack = speed * seconds, 0.5 * _PUSHED * seconds**2
-    least, farthest = max(way - slack, 0.0), min(way + slack, _FASTER * way)
-    # At a quarter of a metre a second and less there is no way to speak of.
-    factors = np.linspace(least, farthest, 1 + math.ceil((farthest - least) / _APART)) / way if way > _FAR else np.ones(1)
-    beside = min(_ASIDE * seconds, _FARTHEST) * np.vstack([across, -across])
-    starts = []
-    for turn in np.linspace(-most, most, 2 * math.ceil(most / _TURN) + 1):
-        q = quaternion.from_matrix(so3.exp(turn * up) @ R_world_imu)
-        chord = _chord(x, turn, seconds)
-        starts += [np.concatenate([q, p + factor * chord]) for factor in factors]
-        starts += [np.concatenate([q, p + chord + offset]) for offset in beside]
-    return starts
+class _Arcs:
+    """Where a platform gets to from a state (36,) within seconds that goes on and turns about the vertical."""
+
+    def __init__(self, x: Floats, seconds: float) -> None:
+        self._R_world_imu, self._p, self._v = x[R : R + 9].reshape(3, 3), x[P : P + 3], x[V : V + 3]
+        self._up = -x[G : G + 3] / np.linalg.norm(x[G : G + 3])
+        self._seconds, self._speed = seconds, float(np.linalg.norm(self._v))
+        self._slack = 0.5 * _PUSHED * seconds**2
+
+    def pose(self, turn: float, factor: float = 1.0, aside: Floats | float = 0.0) -> Floats:
+        """T_world_imu (7,) after a turn [rad] and a factor of the way, moved by `aside` [m]."""
+        q = quaternion.from_matrix(so3.exp(turn * self._up) @ self._R_world_imu)
+        return np.concatenate([q, self._p + factor * self._chord(turn) + aside])
+
+    def speed(self, T_world_imu: Floats) -> Floats:
+        """(3,) velocity at the end of an arc that leads to a pose (7,) [m/s]."""
+        turn = self._turn(T_world_imu)
+        velocity: Floats = so3.exp(0.5 * turn * self._up) @ (T_world_imu[4:] - self._p)
+        return velocity / (self._seconds * max(np.sinc(0.5 * turn / np.pi), _SHORTEST))
+
+    def off(self, T_world_imu: Floats) -> float:
+        """How far a pose (7,) lies from that of the same turn [m]."""
+        return float(np.linalg.norm(T_world_imu[4:] - self._p - self._chord(self._turn(T_world_imu))))
+
+    def is_near(self, T_world_imu: Floats) -> bool:
+        """Whether legs and wheels may have pushed it there."""
+        return self.off(T_world_imu) < self._slack + _ASIDE * self._seconds + _SIGMA
+
+    def starts(self) -> list[Floats]:
+        """Poses (7,) to look around."""
+        most = min(min(_TURN_RATE, _PUSHED / max(self._speed, 1e-3)) * self._seconds + _TURNED, math.pi)
+        way, factors = self._speed * self._seconds, np.ones(1)
+        if way > _FAR:
+            least, farthest = max(way - self._slack, 0.0), min(way + self._slack, _FASTER * way)
+            factors = np.linspace(least, farthest, 1 + math.ceil((farthest - least) / _APART)) / way
+        across = np.linalg.qr(self._up[:, None], mode="complete")[0][:, 1:].T
+        beside = min(_ASIDE * self._seconds, _FARTHEST) * np.vstack([across, -across])
+        poses = []
+        for turn in np.linspace(-most, most, 2 * math.ceil(most / _TURN) + 1):
+            poses += [self.pose(turn, factor) for factor in factors] + [self.pose(turn, 1.0, aside) for aside in beside]
+        return poses
+
+    def _turn(self, T_world_imu: Floats) -> float:
+        return float(self._up @ so3.log(quaternion.to_matrix(T_world_imu[:4]) @ self._R_world_imu.T))
+
+    def _chord(self, turn: float) -> Floats:
+        chord: Floats = so3.exp(0.5 * turn * self._up) @ self._v * (self._seconds * np.sinc(0.5 * turn / np.pi))
+        return chord
 
 
 def _distinct(poses: Sequence[Floats]) -> list[Floats]:

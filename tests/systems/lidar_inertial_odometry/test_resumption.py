@@ -65,7 +65,7 @@ def resumed(boxes: Boxes, seen: Boxes, turn: float, moved: tuple[float, float], 
     return resumption(x, x, p_lidar, tree, Frame(scan, imu, 0, True, seconds)), R_world_imu, p
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(turn=st.floats(-1.5, 1.5), moved=st.tuples(st.floats(-0.5, 1.6), st.floats(-0.8, 1.0)))
 def test_it_is_found_where_it_is(turn: float, moved: tuple[float, float]) -> None:
     again, R_world_imu, p = resumed(ROOM, ROOM, turn, moved)
