@@ -82,7 +82,7 @@ class Watch:
         self._scale: Finding | None = None  # of the gyroscope, said once
         self._scale_was_right = False
         self._astray: Finding | None = None
-        self._blind_scans = 0
+        self._blind_ns: int | None = None  # end of the newest scan within which samples are missing
         self._T_last: NDArray[np.float64] | None = None
         self._T_compared: NDArray[np.float64] = np.eye(4)
         self._first_with_clocks: Agreement | None = None
@@ -130,8 +130,9 @@ class Watch:
         if self._pending is not None and taken_up and not (self._live and not self._pending.done()):
             news = self._take_up(self._pending.result())
             self._pending = None
-        self._blind_scans = len(self._scans) if blind else max(self._blind_scans - 1, 0)
-        if len(self._scans) < _FEWEST_SCANS or self._blind_scans:
+        if blind:
+            self._blind_ns = scan.end_ns
+        if len(self._scans) < _FEWEST_SCANS or self._blind:
             return news
         # What has been named need not be looked for again at once.
         early = suspicious and self.contradiction is None and scan.end_ns >= self._suspected_ns
@@ -153,7 +154,7 @@ class Watch:
         if self._pending is not None:
             news = self._take_up(self._pending.result())
             self._pending = None
-        if not self._decided and len(self._scans) >= _FEWEST_SCANS and not self._blind_scans and self._T_last is not None:
+        if not self._decided and len(self._scans) >= _FEWEST_SCANS and not self._blind and self._T_last is not None:
             news = self._take_up(self._comparison(self._T_last)()) or news
         if self._scale is not None and not self._scale_was_right and self.contradiction is None:
             self.contradiction, news = self._scale, self._scale.text
@@ -161,6 +162,11 @@ class Watch:
             self._pool.shutdown()
             self._pool = None
         return news
+
+    @property
+    def _blind(self) -> bool:
+        """Whether samples are missing within one of the last scans."""
+        return self._blind_ns is not None and self._scans[0].end_ns <= self._blind_ns
 
     def _comparison(self, T_imu_lidar: NDArray[np.float64]) -> Callable[[], Agreement]:
         scans, expected, config = list(self._scans), list(self._expected), self._config

@@ -226,6 +226,30 @@ def test_live_no_scan_waits_for_the_comparison(monkeypatch: pytest.MonkeyPatch) 
     assert told is not None and following.contradiction is not None and following.contradiction.text == told
 
 
+def test_nothing_is_compared_across_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where pauses have left few scans among the last seconds, more come before the last pause is past."""
+    simulation = handheld(4)
+    scans, imu = data(simulation)
+    seen = compare_sensors(scans[:25], imu, CONFIG, T_declared=simulation.T_imu_lidar)
+    compared: list[int] = []
+
+    def compare(scans: Sequence[Scan], *_: Any, **__: Any) -> Agreement:
+        compared.append(scans[0].start_ns)
+        return seen
+
+    monkeypatch.setattr(watch, "compare_sensors", compare)
+    following, still = watch.Watch(CONFIG, simulation.T_imu_lidar), (np.zeros(3), np.zeros(3))
+    paused = 10, 22, 34  # tenths of a second
+    times = [k for k in range(150) if not any(k in range(pause, pause + 8) for pause in paused)]
+    after = [times.index(pause + 8) for pause in paused]
+    for number, tenths in enumerate(times):
+        scan = scans[0].shifted(tenths * 100_000_000)
+        following.add(scan, imu, simulation.T_imu_lidar, still, suspicious=True, blind=number in after)
+    following.finish()
+    last = scans[0].start_ns + times[after[-1]] * 100_000_000
+    assert compared and min(compared) > last
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("degrees", "named"), [(6.0, True), (0.0, False)])
 def test_a_given_mounting_is_contradicted_by_all_stretches_together_and_stays_so(degrees: float, named: bool) -> None:

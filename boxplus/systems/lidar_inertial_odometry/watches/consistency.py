@@ -82,6 +82,7 @@ class Consistency:
         self._innovation_text: str | None = None
         self._unmatched = 0
         self._previous_start_ns: int | None = None
+        self._end_ns = 0  # of the scan before
         self._first_biases: NDArray[np.float64] | None = None
         self._steady, self._corrections = SteadyBias(config.gyro_bias_walk), Corrections()
         self._stuck = StuckSensor()
@@ -163,7 +164,8 @@ class Consistency:
         )
         if news is not None:
             warnings.append(news)
-        self.pause.update(frame, self.contradiction is not None)
+        self._end_ns = frame.scan.end_ns
+        self.pause.update(self._end_ns, self.contradiction is not None)
         if self._unmatched == _LOST_STREAK:
             warnings.append(
                 f"only {matched_share:.0%} of the points fit the map, and too few in {_LOST_STREAK} scans in a row: the "
@@ -173,7 +175,9 @@ class Consistency:
 
     def finish(self) -> str | None:
         """No more scans will come; returns a contradiction that is new."""
-        return self._watch.finish()
+        news = self._watch.finish()
+        self.pause.update(self._end_ns, self.contradiction is not None)
+        return news
 
     def _innovate(self, frame: Frame, correction: NDArray[np.float64], update: MountedUpdate) -> list[str]:
         """The correction of the pose against what the prediction's covariance allows, along the directions that were measured.

@@ -45,11 +45,11 @@ class Pause:
         """A scan comes after a pause."""
         self._ended_ns, self._lasted_s = frame.scan.start_ns, without_scan_s(frame)
 
-    def update(self, frame: Frame, contradicted: bool) -> None:
-        """Take one scan in, and whether the run is contradicted now."""
+    def update(self, now_ns: int, contradicted: bool) -> None:
+        """Whether the run is contradicted at the end of a scan."""
         is_new, self._was_contradicted = contradicted and not self._was_contradicted, contradicted
         if is_new:
-            self.preface = self._preface(frame.scan.end_ns)
+            self.preface = self._preface(now_ns)
 
     def _preface(self, now_ns: int) -> str:
         if self._ended_ns is None or (since_s := (now_ns - self._ended_ns) * 1e-9) > _SOON_S:

@@ -44,11 +44,11 @@ def test_it_is_none_while_the_imu_has_not_come_back() -> None:
 def test_a_contradiction_soon_after_a_pause_of_both(told_s: float, says: bool) -> None:
     pause = Pause()
     pause.begin(frame(0.0, 1.0, 1.0))
-    pause.update(frame(1.1, 1.1, 0.005), False)
+    pause.update(round(1.2 * S), False)
     assert pause.preface == ""
-    pause.update(frame(told_s, told_s, 0.005), True)
+    pause.update(round((told_s + 0.1) * S), True)
     assert bool(pause.preface) is says
     if says:
         assert pause.preface.startswith("1.1 s after a pause of 1.0 s in which neither sensor told")
-        pause.update(frame(30.0, 30.0, 0.005), True)  # the same contradiction, later
+        pause.update(30 * S, True)  # the same contradiction, later
         assert pause.preface
