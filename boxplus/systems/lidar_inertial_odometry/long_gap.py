@@ -38,9 +38,7 @@ def with_unknown_pose(cov: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def gap_text(seconds: float, why: str) -> str:
     """What is said of the gap; `why` a shorter one is none to go on after, a clause."""
-    what = f"no scan for {seconds:.1f} s, longer than {LONGEST_GAP_S:g} s"
-    if why:
-        what = f"neither sensor told for {seconds:.1f} s how the platform moved, and {why}"
+    what = why or f"no scan for {seconds:.1f} s, longer than {LONGEST_GAP_S:g} s"
     return (
         f"{what}: where the platform went meanwhile is not known; a new start and a new map begin at the last position, and the "
         "poses before and after do not belong together: run the parts of the recording separately"

@@ -37,7 +37,7 @@ from boxplus.systems.lidar_inertial_odometry.mounting.mounting_drift import Moun
 from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import MOUNTING, UnknownMounting, mounting_known
 from boxplus.systems.lidar_inertial_odometry.observed_noise import ObservedNoise
 from boxplus.systems.lidar_inertial_odometry.outcome import Outcome
-from boxplus.systems.lidar_inertial_odometry.resumption import GUESSED_S, after_pause, resumption
+from boxplus.systems.lidar_inertial_odometry.resumption import GUESSED_S, after_pause, before_pause, resumption, usual_distance
 from boxplus.systems.lidar_inertial_odometry.snapshots import Snapshots
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 from boxplus.systems.lidar_inertial_odometry.start.first_scan import deskew_first
@@ -92,7 +92,8 @@ class LidarInertialOdometry(Snapshots):
         self._warnings: list[str] = []
         self._x_before: NDArray[np.float64] = np.zeros(0)
         self._motion: NDArray[np.float64] = np.zeros((2, 3))  # turn rate and velocity over the last scan
-        self._guessed_ns = 0  # end of a scan after a pause: until the next one tells, its velocity is guessed
+        self._points = np.zeros((0, 3), np.float32)  # the thinned scan
+        self._guessed_ns = -1  # end of a scan after a pause: until the next one tells, its velocity is guessed
         self._one_way = False  # whether the LiDAR sees one way
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
@@ -183,17 +184,20 @@ class LidarInertialOdometry(Snapshots):
     def _resume(self, frame: Frame) -> Frame:
         """After a pause of both sensors: from where its scan fits the map and nowhere else, or from a new start."""
         self._consistency.pause.begin(frame)
-        x, cov, time_ns, begin = self._x.copy(), self._cov.copy(), self._time_ns, after_pause(frame)
-        self._time_ns = begin.begin_ns
-        p_lidar = self._voxel_filter(self._deskew(begin, self._noise.density)[0])[0]
-        again = resumption(x, self._x, p_lidar, self.map, frame)
-        self._x[:], self._cov[:], self._time_ns = x, cov, time_ns
+        held, begin, density = (self._x.copy(), self._cov.copy(), self._time_ns), after_pause(frame), self._noise.density
+        usual_m, (imu, paused_ns) = usual_distance(self._points, self._x, self.map), before_pause(frame)
+        self._carry(self._x, self._cov, imu, paused_ns, density)
+        x, cov, self._time_ns = self._x.copy(), self._cov.copy(), begin.begin_ns
+        p_lidar = self._voxel_filter(self._deskew(begin, density)[0])[0]
+        again = resumption(x, usual_m, self._x, p_lidar, self.map, frame.scan, (frame.scan.end_ns - paused_ns) * 1e-9)
         if again.x is None:
-            return frame if frame.duration_s < GUESSED_S else self._interrupt(frame, again.text)
-        self._x[:], self._time_ns = again.x, begin.begin_ns
-        self._cov += np.diag(again.variances)
-        self._guessed_ns = frame.scan.end_ns
+            self._x[:], self._cov[:], self._time_ns = held
+            if frame.duration_s >= GUESSED_S:
+                return self._interrupt(frame, again.text)
+            self._warnings.append(f"{again.text}: its motion is held")
+            return frame
         self._warnings.append(again.text)
+        self._x[:], self._cov[:], self._guessed_ns = again.x, cov + np.diag(again.variances), frame.scan.end_ns
         return begin
 
     def _interrupt(self, frame: Frame, why: str = "") -> Frame:
@@ -340,16 +344,14 @@ class LidarInertialOdometry(Snapshots):
 
     def _thinned(self, p_lidar: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Centroids and representatives of a scan; the map's cells become those that suit it."""
-        voxel, (points, map_points) = self._voxel_filter.voxel_size, self._voxel_filter(p_lidar)  # in this order: it adapts
-        self.map.cell_size = map_cell_for(points, voxel, self.config)
-        return points, map_points
+        voxel, (self._points, map_points) = self._voxel_filter.voxel_size, self._voxel_filter(p_lidar)  # so ordered: it adapts
+        self.map.cell_size = map_cell_for(self._points, voxel, self.config)
+        return self._points, map_points
 
     def _measurement(self, frame: Frame, points: NDArray[np.float32]) -> PlaneMeasurement:
-        with_extrinsic = self.config.extrinsic_estimation != "off"
-        weight = _BLIND_WEIGHT if self._is_blind(frame) else 1.0
-        sparse = self._one_way
+        weight, asked = _BLIND_WEIGHT if self._is_blind(frame) else 1.0, self.config.extrinsic_estimation != "off"
         return PlaneMeasurement(
-            points, self.map, self.config, with_extrinsic=with_extrinsic, weight=weight, confirm=True, bend_sparse=sparse
+            points, self.map, self.config, with_extrinsic=asked, weight=weight, confirm=True, bend_sparse=self._one_way
         )
 
     def _is_blind(self, frame: Frame) -> bool:
@@ -373,8 +375,7 @@ class LidarInertialOdometry(Snapshots):
         timing_s: Mapping[str, float] | None = None,
     ) -> Estimate:
         """What is said of a scan; without an outcome it is the first one, which is exact by definition."""
-        warnings, self._warnings = self._warnings, []
-        warnings += imu_words(frame, self.config.max_imu_gap)
+        warnings, self._warnings = [*self._warnings, *imu_words(frame, self.config.max_imu_gap)], []
         pose = self._unshown.widened(self._datum.pose_covariance(self._x), self._time_ns)
         return Estimate(
             time_ns=frame.scan.end_ns,

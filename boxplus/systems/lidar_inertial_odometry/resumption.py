@@ -20,7 +20,9 @@ from boxplus.manifolds import quaternion, se3, so3
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
 from boxplus.maps.local_maps.registration import Surface, approach, mean_distance, planes_beside, refine
+from boxplus.maps.plane_measurement import sees_one_way
 from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.sensors.lidar.scan import Scan
 from boxplus.sensors.sequencer import Frame
 from boxplus.systems.lidar_inertial_odometry.watches.pause import LEAST_S
 
@@ -31,16 +33,24 @@ _TURN, _TURN_RATE, _TURNED = np.deg2rad([12.0, 120.0, 12.0])  # between starts; 
 _PUSHED = 6.0  # m/s²: wheels and legs hardly ever push, brake and turn harder
 _FASTER, _APART, _FAR = 1.4, 2.0, 0.5  # of the way ahead; m, between starts along it; m: of a shorter one none
 _STRAYED, _STRAYED_TURN = 3.0, np.deg2rad(25.0)  # m: a registration that goes farther has left where the platform may be
-_ASIDE, _FARTHEST = 1.0, 2.0  # m/s, m
+_WALK, _FARTHEST = 1.5, 6.0  # m/s, m: beside the way ahead, and anywhere around where that is short
+_UPWARD = 0.3  # m/s, beside the way before
 _GLANCED, _ROUGH, _POINTS = 300, 1000, 1500  # points for each start, each that is carried on, and each place
 _GLANCE, _CLOSE = 1.0, 0.3  # m, at which a point no longer fits
 _CARRIED, _LOOKED_AT = 24, 4
-_SAME_TURN, _SAME = np.deg2rad(5.0), 0.3  # m: nearer to each other than this two places are one
+_SAME_TURN, _SAME = np.deg2rad(10.0), 0.3  # m: nearer to each other than this two places are one
 _DISTANCE, _STEPS = 0.8, 15
 _MAPPED, _LEAST_MAPPED = 2.0, 0.3  # m; share of the points
 _ASTRAY = 0.5  # m, along what is open
-_FITS, _RMS = 0.13, 0.06  # m: mean distance, and spread of the points on planes, of a scan that lies where it belongs
-_CLEARLY, _FLAT = 1.3, 0.02  # times worse any other place has to fit; m, of surfaces
+# Mean distance of a scan that lies where it belongs, from that of the scan before the pause: a LiDAR that sees all around has
+# most of it mapped; one that sees one way may look at what is not, while another place happens to look alike. So may, after
+# seconds, one that has climbed to another storey.
+_GROWN, _GROWN_M, _MORE_M = 3.0, 0.02, 0.08  # times and m; m at most
+_LONG_S, _GROWN_LONG, _GROWN_LONG_M = 2.0, 2.0, 0.01
+_GROWN_ONE_WAY, _GROWN_ONE_WAY_M = 1.5, 0.005
+_RMS = 0.06  # m, of the points on planes
+# Times and m by which any other place has to fit worse: a tenth of the points may see what is not mapped yet.
+_CLEARLY, _CLEARLY_M, _MAY_FIT = 1.3, 0.03, 0.06  # m: of one that may well be right
 GUESSED_S = 0.75  # up to this long after the last scan its motion may be held
 _HELD_S = 1.0  # the same where the scan fits along a line: nobody turns round as fast
 _TURN_SIGMA, _SIGMA, _SPEED_SIGMA = 0.1, 0.3, 0.3  # rad, m, m/s: of the first state after a pause
@@ -84,9 +94,7 @@ def _places(p_imu: Points, tree: IkdTree, arcs: _Arcs) -> list[Place]:
         if found is None:
             return []
         T, lengths = found.T_target_source, np.repeat([found.lever_m, 1.0], 3)
-        planes, valid = planes_beside(points, target, T, _DISTANCE, config)
-        distances = np.where(valid, np.minimum(np.abs(planes[:, 3]), _CLOSE), _CLOSE)
-        mapped = tree.nearest(se3.act(T, points.astype(np.float64)), 1, max_distance=_MAPPED).counts > 0
+        distances, mapped = _distances(points, tree, T)
         return [Place(T, float(distances.mean()), found.rms, found.weak / lengths, distances, mapped)]
 
     starts = arcs.starts()
@@ -106,13 +114,38 @@ def _places(p_imu: Points, tree: IkdTree, arcs: _Arcs) -> list[Place]:
     return [place for place in found if any(place.T_world_imu is T for T in kept)]
 
 
+def _seen_from_imu(p_lidar: Points, x: Floats) -> Points:
+    state = NavState.unpack(x)
+    return (p_lidar @ state.R_imu_lidar.T + state.p_imu_lidar).astype(np.float32)
+
+
+def _distances(p_imu: Points, tree: IkdTree, T_world_imu: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """`Place.distances` and `Place.mapped` of points (n, 3) at a pose (7,)."""
+    target = Surface(np.zeros((0, 3), np.float32), tree)
+    planes, valid = planes_beside(p_imu, target, T_world_imu, _DISTANCE, LocalMapRegistrationConfig())
+    distances = np.where(valid, np.minimum(np.abs(planes[:, 3]), _CLOSE), _CLOSE)
+    return distances, tree.nearest(se3.act(T_world_imu, p_imu.astype(np.float64)), 1, max_distance=_MAPPED).counts > 0
+
+
+def before_pause(frame: Frame) -> tuple[ImuSamples, int]:
+    """The samples before the pause of a frame, and until when they tell [ns]."""
+    time_ns = frame.imu.time_ns
+    last = int(np.argmax(np.diff(time_ns, append=max(frame.scan.end_ns, int(time_ns[-1])))))
+    return frame.imu.where(slice(0, last + 1)), max(int(time_ns[last]), frame.begin_ns)
+
+
 def after_pause(frame: Frame) -> Frame:
-    """The frame without the pause: from the beginning of its scan, with the samples since then."""
-    imu = frame.imu
-    since = int(np.searchsorted(imu.time_ns, frame.scan.start_ns, side="right"))
-    if since and (frame.scan.start_ns - imu.time_ns[since - 1]) * 1e-9 < LEAST_S:
+    """The frame without the pause: from the beginning of its scan, with the samples since then.
+
+    Where the IMU has not come back yet, its last sample is held.
+    """
+    imu, start = frame.imu, frame.scan.start_ns
+    since = int(np.searchsorted(imu.time_ns, start, side="right"))
+    if since and (since == len(imu) or (start - imu.time_ns[since - 1]) * 1e-9 < LEAST_S):
         since -= 1
-    return replace(frame, imu=ImuSamples(imu.time_ns[since:], imu.gyro[since:], imu.accel[since:]), begin_ns=frame.scan.start_ns)
+    return replace(
+        frame, imu=ImuSamples(np.maximum(imu.time_ns[since:], start), imu.gyro[since:], imu.accel[since:]), begin_ns=start
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,32 +163,52 @@ class Resumption:
     text: str
 
 
-def resumption(x: Floats, x_end: Floats, p_lidar: Points, tree: IkdTree, frame: Frame) -> Resumption:
+def usual_distance(p_lidar: Points, x: Floats, tree: IkdTree) -> float:
+    """`Place.distance` [m] of the thinned points (n, 3) of a scan that lies where it belongs, at the state (36,) of its end."""
+    return float(_distances(_spread(_seen_from_imu(p_lidar, x), _POINTS), tree, _Arcs(x, 1.0).pose(0.0, 0.0))[0].mean())
+
+
+def resumption(
+    x: Floats, usual_m: float, x_end: Floats, p_lidar: Points, tree: IkdTree, scan: Scan, seconds: float
+) -> Resumption:
     """Where to go on after a pause.
 
     Args:
-        x: (36,) state before it; x_end: what the IMU makes of it from the beginning of the scan to its end.
+        x: (36,) state at its begin; usual_m: `usual_distance` of the scan before.
+        x_end: what the IMU makes of x from the beginning of the scan to its end.
         p_lidar: (N, 3) thinned points of the scan as seen from the LiDAR at its end [m].
-        frame: of the scan, with the pause.
+        scan: the first one after the pause; it ends so many `seconds` after its begin.
     """
-    state, seconds = NavState.unpack(x_end), frame.duration_s
-    p_imu = (p_lidar @ state.R_imu_lidar.T + state.p_imu_lidar).astype(np.float32)
-    arcs = _Arcs(x, seconds)
-    found = _places(p_imu, tree, arcs)
-    if not found or found[0].distance > _FITS or found[0].rms > _RMS:
-        return _nowhere("the scan after it fits the map at no place that the platform may have got to")
+    arcs, scan_s = _Arcs(x, seconds), (scan.end_ns - scan.start_ns) * 1e-9
+    found = _places(_seen_from_imu(p_lidar, x), tree, arcs)
+    told = f"neither sensor told for {seconds - scan_s:.1f} s how the platform moved"
+    if not found or found[0].distance > _largest(usual_m, seconds, sees_one_way(p_lidar)) or found[0].rms > _RMS:
+        return _nowhere(f"{told}, and the scan after it fits the map at no place that the platform may have got to")
     alike = [found[0], *(place for place in found[1:] if _fits_alike(found[0], place))]
     alone = len(alike) == 1
     place = found[0] if alone else _as_before(alike, arcs, seconds)
     if place is None:
         apart = np.linalg.norm(alike[1].T_world_imu[4:] - alike[0].T_world_imu[4:])
         turned = np.rad2deg(_turned(alike[0].T_world_imu, alike[1].T_world_imu))
-        return _nowhere(f"the scan after it fits the map as well at places {apart:.1f} m and {turned:.0f} deg from each other")
-    again = _at_begin(place, x, x_end, arcs, (frame.scan.end_ns - frame.scan.start_ns) * 1e-9)
+        return _nowhere(f"{told}, and the scan after it fits the map alike at places {apart:.1f} m and {turned:.0f} deg apart")
+    again = _at_begin(place, x, x_end, arcs, scan_s)
     variances, sigma = np.zeros(TANGENT), _SIGMA if alone else _SIGMA + _PUSHED_ON * seconds**2
     variances[T_THETA : T_THETA + 3], variances[T_P : T_P + 3] = _TURN_SIGMA**2, sigma**2
     variances[T_V : T_V + 3] = (_SPEED_SIGMA + 2.0 * _PUSHED_ON * seconds) ** 2
-    return Resumption(again, variances, _found_text(again, x, seconds, alone=alone))
+    moved = float(np.linalg.norm(again[P : P + 3] - x[P : P + 3]))
+    where = "at the one place where the scan fits the map"
+    if not alone:
+        where = "where it would be, had it gone on as before, of the places at which the scan fits the map alike"
+    return Resumption(again, variances, f"{told}: found again {moved:.1f} m from where it was, {where}")
+
+
+def _largest(usual_m: float, seconds: float, one_way: bool) -> float:
+    """`Place.distance` [m] of a scan that lies where it belongs, at most."""
+    if one_way:
+        return _GROWN_ONE_WAY * usual_m + _GROWN_ONE_WAY_M
+    if seconds > _LONG_S:
+        return min(_GROWN_LONG * usual_m + _GROWN_LONG_M, usual_m + _MORE_M)
+    return min(_GROWN * usual_m + _GROWN_M, usual_m + _MORE_M)
 
 
 def _fits_alike(best: Place, other: Place) -> bool:
@@ -167,19 +220,12 @@ def _fits_alike(best: Place, other: Place) -> bool:
     both = best.mapped & other.mapped
     if _turned(best.T_world_imu, other.T_world_imu) > _SAME_TURN or both.mean() < _LEAST_MAPPED:
         both[:] = True
-    return float(other.distances[both].mean()) < _CLEARLY * max(float(best.distances[both].mean()), _FLAT)
+    least = float(best.distances[both].mean())
+    return float(other.distances[both].mean()) < max(_CLEARLY * least, least + _CLEARLY_M, _MAY_FIT)
 
 
 def _nowhere(why: str) -> Resumption:
     return Resumption(None, np.zeros(TANGENT), why)
-
-
-def _found_text(again: Floats, x: Floats, seconds: float, *, alone: bool) -> str:
-    moved = float(np.linalg.norm(again[P : P + 3] - x[P : P + 3]))
-    where = "at the one place where the scan fits the map"
-    if not alone:
-        where = "where it would be, had it gone on as before, of the places at which the scan fits the map as well as there"
-    return f"neither sensor told for {seconds:.1f} s how the platform moved: found again {moved:.1f} m from where it was, {where}"
 
 
 def _as_before(alike: Sequence[Place], arcs: _Arcs, seconds: float) -> Place | None:
@@ -229,8 +275,10 @@ class _Arcs:
         return float(np.linalg.norm(T_world_imu[4:] - self._p - self._chord(self._turn(T_world_imu))))
 
     def is_near(self, T_world_imu: Floats) -> bool:
-        """Whether legs and wheels may have pushed it there."""
-        return self.off(T_world_imu) < self._slack + _ASIDE * self._seconds + _SIGMA
+        """Whether legs and wheels may have pushed it there; up and down they hardly do, and storeys are alike."""
+        off = T_world_imu[4:] - self.pose(self._turn(T_world_imu))[4:]
+        upward, along = abs(float(self._up @ off)), float(np.linalg.norm(off))
+        return along < self._slack + _WALK * self._seconds + _SIGMA and upward < _UPWARD * self._seconds + _SIGMA
 
     def starts(self) -> list[Floats]:
         """Poses (7,) to look around."""
@@ -239,12 +287,19 @@ class _Arcs:
         if way > _FAR:
             least, farthest = max(way - self._slack, 0.0), min(way + self._slack, _FASTER * way)
             factors = np.linspace(least, farthest, 1 + math.ceil((farthest - least) / _APART)) / way
-        across = np.linalg.qr(self._up[:, None], mode="complete")[0][:, 1:].T
-        beside = min(_ASIDE * self._seconds, _FARTHEST) * np.vstack([across, -across])
+        beside = self._around(min(_WALK * self._seconds, _FARTHEST), rings=way < _WALK * self._seconds)
         poses = []
         for turn in np.linspace(-most, most, 2 * math.ceil(most / _TURN) + 1):
             poses += [self.pose(turn, factor) for factor in factors] + [self.pose(turn, 1.0, aside) for aside in beside]
         return poses
+
+    def _around(self, radius: float, *, rings: bool) -> Floats:
+        """(n, 3) offsets on the level [m]: four, or in rings that leave no gap."""
+        count = math.ceil(radius / _APART) if rings else 1
+        e, f = np.linalg.qr(self._up[:, None], mode="complete")[0][:, 1:].T
+        sides = 6 if rings else 4
+        angles = [(k * radius / count, 2.0 * np.pi * j / (sides * k)) for k in range(1, count + 1) for j in range(sides * k)]
+        return np.array([r * (np.cos(a) * e + np.sin(a) * f) for r, a in angles])
 
     def _turn(self, T_world_imu: Floats) -> float:
         return float(self._up @ so3.log(quaternion.to_matrix(T_world_imu[:4]) @ self._R_world_imu.T))

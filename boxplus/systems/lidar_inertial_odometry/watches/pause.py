@@ -18,9 +18,8 @@ def without_scan_s(frame: Frame) -> float:
 
 
 def is_pause(frame: Frame) -> bool:
-    """Whether nothing told for a while how the platform moved, and both sensors go on."""
-    goes_on = bool(len(frame.imu) and frame.imu.time_ns[-1] > frame.scan.start_ns)
-    return min(frame.largest_gap_s, without_scan_s(frame)) > LEAST_S and goes_on
+    """Whether nothing told for a while how the platform moved; the IMU may come back later than the LiDAR."""
+    return min(frame.largest_gap_s, without_scan_s(frame)) > LEAST_S
 
 
 class Pause:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -32,12 +30,6 @@ def frame(begin_s: float, start_s: float, imu_gap_s: float) -> Frame:
 )
 def test_it_is_one_where_both_stop(begin_s: float, imu_gap_s: float, expected: bool) -> None:
     assert is_pause(frame(begin_s, 1.0, imu_gap_s)) is expected
-
-
-def test_it_is_none_while_the_imu_has_not_come_back() -> None:
-    paused = frame(0.0, 1.0, 1.0)
-    before = ImuSamples(np.array([S // 10]), np.zeros((1, 3)), np.zeros((1, 3)))
-    assert is_pause(paused) and not is_pause(replace(paused, imu=before))
 
 
 @pytest.mark.parametrize(("told_s", "says"), [(2.0, True), (12.0, False)])
