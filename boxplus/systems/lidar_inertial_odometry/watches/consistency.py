@@ -269,7 +269,7 @@ class Consistency:
         if self._corrected_from_ns is None:  # a map as thick as a scan, metres from the next one, pulls fast ones back and forth
             fast = math.hypot(*update.posterior.x[V : V + 3].tolist()) > _FAST_M_S
             self._corrected_from_ns = frame.scan.end_ns + (_THIN_MAP_NS if fast else 0)
-        thin = frame.scan.end_ns < self._corrected_from_ns
+        thin = frame.scan.end_ns < self._corrected_from_ns or self.pause.settles(frame.scan.end_ns)
         # Of a scan off the map nothing is taken up, and the next one wants the same again.
         if sought or gap or thin or self.lost or not update.posterior.valid:
             self._corrections.clear()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from boxplus.sensors.sequencer import Frame
 
 LEAST_S = 0.25  # nobody's sensors stutter for as long
+_SETTLING_S = 1.0
 _SOON_S = 10.0  # after it; later, what is contradicted has other causes
 
 
@@ -43,6 +44,10 @@ class Pause:
     def begin(self, frame: Frame) -> None:
         """A scan comes after a pause."""
         self._ended_ns, self._lasted_s = frame.scan.start_ns, without_scan_s(frame)
+
+    def settles(self, now_ns: int) -> bool:
+        """Whether the speed, which was guessed after it, may still be coming right."""
+        return self._ended_ns is not None and (now_ns - self._ended_ns) * 1e-9 < _SETTLING_S
 
     def update(self, now_ns: int, contradicted: bool) -> None:
         """Whether the run is contradicted at the end of a scan."""

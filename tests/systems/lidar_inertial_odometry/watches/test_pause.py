@@ -44,3 +44,10 @@ def test_a_contradiction_soon_after_a_pause_of_both(told_s: float, says: bool) -
         assert pause.preface.startswith("1.1 s after a pause of 1.0 s in which neither sensor told")
         pause.update(30 * S, True)  # the same contradiction, later
         assert pause.preface
+
+
+def test_for_a_second_after_it_the_speed_comes_right() -> None:
+    pause = Pause()
+    assert not pause.settles(2 * S)
+    pause.begin(frame(0.0, 1.0, 1.0))
+    assert pause.settles(round(1.9 * S)) and not pause.settles(round(2.1 * S))
