@@ -230,9 +230,10 @@ def _nowhere(why: str) -> Resumption:
 
 def _as_before(alike: Sequence[Place], arcs: _Arcs, seconds: float) -> Place | None:
     """Of places that fit alike, as along a corridor, that of a platform that went on as before; None where that cannot tell."""
-    place = min(alike, key=lambda one: arcs.off(one.T_world_imu))
-    told = seconds <= _HELD_S and arcs.off(place.T_world_imu) <= _SIGMA + _PUSHED_ON * seconds**2
-    if not told or any(_turned(place.T_world_imu, other.T_world_imu) > _SAME_TURN for other in alike):
+    place = min(alike, key=lambda one: float(np.linalg.norm(arcs.off(one.T_world_imu))))
+    off = float(np.linalg.norm(arcs.off(place.T_world_imu)))
+    turned = any(_turned(place.T_world_imu, other.T_world_imu) > _SAME_TURN for other in alike)
+    if turned or seconds > _HELD_S or off > _SIGMA + _PUSHED_ON * seconds**2:
         return None
     return place
 
@@ -270,15 +271,16 @@ class _Arcs:
         velocity: Floats = so3.exp(0.5 * turn * self._up) @ (T_world_imu[4:] - self._p)
         return velocity / (self._seconds * max(np.sinc(0.5 * turn / np.pi), _SHORTEST))
 
-    def off(self, T_world_imu: Floats) -> float:
-        """How far a pose (7,) lies from that of the same turn [m]."""
-        return float(np.linalg.norm(T_world_imu[4:] - self._p - self._chord(self._turn(T_world_imu))))
+    def off(self, T_world_imu: Floats) -> Floats:
+        """(3,) from where one would be that turned as far to a pose (7,) [m]."""
+        off: Floats = T_world_imu[4:] - self._p - self._chord(self._turn(T_world_imu))
+        return off
 
     def is_near(self, T_world_imu: Floats) -> bool:
         """Whether legs and wheels may have pushed it there; up and down they hardly do, and storeys are alike."""
-        off = T_world_imu[4:] - self.pose(self._turn(T_world_imu))[4:]
-        upward, along = abs(float(self._up @ off)), float(np.linalg.norm(off))
-        return along < self._slack + _WALK * self._seconds + _SIGMA and upward < _UPWARD * self._seconds + _SIGMA
+        off = self.off(T_world_imu)
+        is_level = abs(float(self._up @ off)) < _UPWARD * self._seconds + _SIGMA
+        return is_level and float(np.linalg.norm(off)) < self._slack + _WALK * self._seconds + _SIGMA
 
     def starts(self) -> list[Floats]:
         """Poses (7,) to look around."""
