@@ -19,6 +19,15 @@ def begins_blind(frame: Frame, max_gap_s: float) -> bool:
     return bool(len(before) and ((after[0] if len(after) else frame.scan.end_ns) - before[-1]) * 1e-9 > max_gap_s)
 
 
+def guessed_until(frame: Frame, guessed_ns: int) -> int:
+    """Until when the velocity is guessed after a pause [ns]: where the IMU is back later than the LiDAR, for two scans more.
+
+    Within its gap the velocity is known to a metre a second, which distorts the first scan after it by a decimetre.
+    """
+    scan = frame.scan
+    return scan.end_ns + 3 * (scan.end_ns - scan.start_ns) // 2 if frame.begin_ns <= guessed_ns else guessed_ns
+
+
 def mean_motion(x_before: NDArray[np.float64], x: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
     """(2, 3) turn rate in the IMU frame [rad/s] and velocity in the world [m/s] that lead from one state (36,) to another."""
     moved = np.empty(TANGENT)

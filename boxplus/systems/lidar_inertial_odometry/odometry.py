@@ -28,7 +28,7 @@ from boxplus.sensors.sequencer import AFTER_GAP, BEFORE_START, Frame, Sequencer,
 from boxplus.systems.lidar_inertial_agreement.lidar_path.registration import align
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.estimate import WAITED, Estimate, Prediction
-from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, imu_words, mean_motion, with_turn_rate
+from boxplus.systems.lidar_inertial_odometry.imu_gap import begins_blind, guessed_until, imu_words, mean_motion, with_turn_rate
 from boxplus.systems.lidar_inertial_odometry.long_gap import LONGEST_GAP_S, after_gap, gap_text, with_unknown_pose
 from boxplus.systems.lidar_inertial_odometry.map_cell import map_cell_for
 from boxplus.systems.lidar_inertial_odometry.mounted_update import mounted_update
@@ -93,7 +93,7 @@ class LidarInertialOdometry(Snapshots):
         self._x_before: NDArray[np.float64] = np.zeros(0)
         self._motion: NDArray[np.float64] = np.zeros((2, 3))  # turn rate and velocity over the last scan
         self._points = np.zeros((0, 3), np.float32)  # the thinned scan
-        self._guessed_ns = -1  # end of a scan after a pause: until the next one tells, its velocity is guessed
+        self._guessed_ns = -1  # after a pause: of scans that begin until then the velocity is guessed
         self._one_way = False  # whether the LiDAR sees one way
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
@@ -291,8 +291,8 @@ class LidarInertialOdometry(Snapshots):
 
     def _see_motion(self, frame: Frame) -> Frame:
         """Within a gap of the IMU: the frame and the state with the turn rate and velocity at which its points fit the map."""
-        x, cov = self._x.copy(), self._cov.copy()
-        seconds = (frame.scan.end_ns - self._time_ns) * 1e-9
+        x, cov, seconds = self._x.copy(), self._cov.copy(), (frame.scan.end_ns - self._time_ns) * 1e-9
+        self._guessed_ns = guessed_until(frame, self._guessed_ns)
         for _ in range(_BLIND_PASSES):
             points = self._voxel_filter(self._deskew(frame, self._noise.density)[0])[0][::_BLIND_STRIDE].copy()
             measurement = PlaneMeasurement(points, self.map, self.config, with_extrinsic=False)
@@ -355,7 +355,7 @@ class LidarInertialOdometry(Snapshots):
         )
 
     def _is_blind(self, frame: Frame) -> bool:
-        return frame.largest_gap_s > self.config.max_imu_gap or frame.begin_ns == self._guessed_ns
+        return frame.largest_gap_s > self.config.max_imu_gap or frame.begin_ns <= self._guessed_ns
 
     def _is_astray(self, frame: Frame, on_map: float) -> bool:
         """Whether what fits the map may fit it by chance: after a gap of the IMU nothing but the points says where it is."""
