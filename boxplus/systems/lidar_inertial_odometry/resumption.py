@@ -37,7 +37,7 @@ _WALK, _FARTHEST = 1.5, 6.0  # m/s, m: beside the way ahead, and anywhere around
 _UPWARD = 0.3  # m/s, beside the way before
 _GLANCED, _ROUGH, _POINTS = 300, 1000, 1500  # points for each start, each that is carried on, and each place
 _GLANCE, _CLOSE = 1.0, 0.3  # m, at which a point no longer fits
-_CARRIED, _LOOKED_AT = 24, 4
+_CARRIED, _LOOKED_AT = 24, 8
 _SAME_TURN, _SAME = np.deg2rad(10.0), 0.3  # m: nearer to each other than this two places are one
 _DISTANCE, _STEPS = 0.8, 15
 _MAPPED, _LEAST_MAPPED = 2.0, 0.3  # m; share of the points
@@ -80,7 +80,7 @@ class Place:
 
 
 def _places(p_imu: Points, tree: IkdTree, arcs: _Arcs) -> list[Place]:
-    """The places that fit best, best first: at most four, and those beside the best one where the surfaces leave it open.
+    """The places that fit best, best first: at most nine, and those beside the best one where the surfaces leave it open.
 
     Args:
         p_imu: (N, 3) thinned points of a scan [m], as seen from the IMU at its end.
