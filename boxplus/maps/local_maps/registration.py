@@ -98,7 +98,7 @@ def register(
     if T is None:
         return None
     distance, _, count = _STAGES[-1]
-    found = _Matched.of(_spread(source.points, count), target, T, distance, config)
+    found = _Matched.of(spread(source.points, count), target, T, distance, config)
     if found is None:
         return None
     covariance, information, weak = found.covariance(config, np.zeros((6, 6)) if deformation is None else deformation)
@@ -128,7 +128,7 @@ def _staged(
 ) -> Floats | None:
     T = np.array(T_start, dtype=np.float64)
     for distance, steps, count in stages:
-        points = _spread(source.points, count)
+        points = spread(source.points, count)
         for _ in range(steps):
             found = _Matched.of(points, target, T, distance, config, max(blunt * distance, LEAST_RESIDUAL_SCALE))
             if found is None:
@@ -179,30 +179,34 @@ def surface_distance(
     source: Surface, target: Surface, T_target_source: Floats, config: LocalMapRegistrationConfig
 ) -> float | None:
     """Robust standard deviation of the distances of a source's points to the target's planes [m], laid over it as given."""
-    distance, _, count = _STAGES[-1]
-    found = _Matched.of(_spread(source.points, count // 4), target, T_target_source, distance, config)
-    return None if found is None else found.scale
+    distances = _distances(spread(source.points, _STAGES[-1][2] // 4), target, T_target_source, config)
+    return None if distances is None else residual_scale(distances)
 
 
 def fitting_share(
     source: Surface, target: Surface, T_target_source: Floats, tolerance: float, config: LocalMapRegistrationConfig
 ) -> float:
     """Share of a source's points that lie within `tolerance` [m] of a plane of the target; one without a plane does not."""
-    distance, _, count = _STAGES[-1]
-    points = _spread(source.points, count)
-    found = _Matched.of(points, target, T_target_source, distance, config)
-    return 0.0 if found is None else float(np.count_nonzero(np.abs(found.e) <= tolerance)) / len(points)
+    points = spread(source.points, _STAGES[-1][2])
+    distances = _distances(points, target, T_target_source, config)
+    return 0.0 if distances is None else float(np.count_nonzero(distances <= tolerance)) / len(points)
 
 
 def mean_distance(
     points: NDArray[np.float32], target: Surface, T_target_source: Floats, limit: float, config: LocalMapRegistrationConfig
 ) -> float:
     """Mean distance of points (N, 3) of a source from the planes of the target, each `limit` [m] at most, and without one."""
-    found = _Matched.of(points, target, T_target_source, _STAGES[-1][0], config)
-    if found is None:
+    distances = _distances(points, target, T_target_source, config)
+    if distances is None:
         return limit
-    beyond = limit * (len(points) - len(found.e))
-    return (float(np.minimum(np.abs(found.e), limit).sum()) + beyond) / len(points)
+    beyond = limit * (len(points) - len(distances))
+    return (float(np.minimum(distances, limit).sum()) + beyond) / len(points)
+
+
+def _distances(points: NDArray[np.float32], target: Surface, T: Floats, config: LocalMapRegistrationConfig) -> Floats | None:
+    """Distances (n,) of the points that lie beside a plane of the target to that [m]; None where too few do."""
+    planes, valid = planes_beside(points, target, T, _STAGES[-1][0], config)
+    return np.abs(planes[valid, 3]) if np.count_nonzero(valid) >= FEWEST_ON_PLANES else None
 
 
 def plane_normals(points: NDArray[np.float32], surface: Surface, config: LocalMapRegistrationConfig) -> Floats:
@@ -324,7 +328,7 @@ def has_information(values: Floats, weight: Floats, planes: Floats, config: Loca
     return np.asarray(values > max(config.weak_information * weight.sum(), NOISE * float(weight @ planes[:, 4])))
 
 
-def _spread(points: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+def spread(points: NDArray[np.float32], count: int) -> NDArray[np.float32]:
     """About `count` of the points, one in so many."""
     return np.ascontiguousarray(points[:: max(len(points) // count, 1)])
 
@@ -348,7 +352,7 @@ def planes_beside(
 
 
 def _share_near(points: NDArray[np.float32], target: Surface, T: Floats, distance: float) -> float:
-    chosen = se3.act(T, _spread(points, 4000).astype(np.float64))
+    chosen = se3.act(T, spread(points, 4000).astype(np.float64))
     return float(np.mean(target.tree.nearest(chosen, 1, max_distance=distance).counts > 0))
 
 
