@@ -9,8 +9,9 @@ already are carried on. A place counts if its scan fits there far better than an
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from boxplus.filtering.nav_state import T_P, T_THETA, T_V, TANGENT, G, NavState,
 from boxplus.manifolds import quaternion, se3, so3
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.local_maps.config import LocalMapRegistrationConfig
-from boxplus.maps.local_maps.registration import Surface, approach, mean_distance, planes_beside, refine
+from boxplus.maps.local_maps.registration import Surface, approach, mean_distance, planes_beside, refine, spread
 from boxplus.maps.plane_measurement import sees_one_way
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
@@ -28,6 +29,7 @@ from boxplus.systems.lidar_inertial_odometry.watches.pause import LEAST_S
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
+Found = TypeVar("Found")
 
 _TURN, _TURN_RATE, _TURNED = np.deg2rad([12.0, 120.0, 12.0])  # between starts; how fast one turns, and could have from the first
 _PUSHED = 6.0  # m/s²: wheels and legs hardly ever push, brake and turn harder
@@ -64,19 +66,22 @@ class Place:
 
     Attributes:
         T_world_imu: (7,) at the end of the scan.
-        distance: of its points from the planes of the map in the mean, none of which counts as more than 0.3 m [m].
         rms: robust standard deviation of the points that lie on planes [m].
         open: (k, 6) twists on the right of the pose, a metre at the points, that the surfaces leave open.
-        distances: (n,) of the points [m], of which `distance` is the mean.
+        distances: (n,) of the points from the planes of the map, none of which counts as more than 0.3 m [m].
         mapped: (n,) whether the map has anything within 2 m of them.
     """
 
     T_world_imu: Floats
-    distance: float
     rms: float
     open: Floats
     distances: Floats
     mapped: NDArray[np.bool_]
+
+    @property
+    def distance(self) -> float:
+        """In the mean [m]."""
+        return float(self.distances.mean())
 
 
 def _places(p_imu: Points, tree: IkdTree, arcs: _Arcs) -> list[Place]:
@@ -87,7 +92,7 @@ def _places(p_imu: Points, tree: IkdTree, arcs: _Arcs) -> list[Place]:
         arcs: from the state before the pause to that time.
     """
     config, target = LocalMapRegistrationConfig(), Surface(np.zeros((0, 3), np.float32), tree)
-    glanced, rough, points = (_spread(p_imu, count) for count in (_GLANCED, _ROUGH, _POINTS))
+    glanced, rough, points = (spread(p_imu, count) for count in (_GLANCED, _ROUGH, _POINTS))
 
     def laid(T_start: Floats) -> list[Place]:
         found = refine(points, target, T_start, config, distance=_DISTANCE, steps=_STEPS)
@@ -95,7 +100,7 @@ def _places(p_imu: Points, tree: IkdTree, arcs: _Arcs) -> list[Place]:
             return []
         T, lengths = found.T_target_source, np.repeat([found.lever_m, 1.0], 3)
         distances, mapped = _distances(points, tree, T)
-        return [Place(T, float(distances.mean()), found.rms, found.weak / lengths, distances, mapped)]
+        return [Place(T, found.rms, found.weak / lengths, distances, mapped)]
 
     starts = arcs.starts()
     fits = [mean_distance(glanced, target, T, _GLANCE, config) for T in starts]
@@ -105,13 +110,13 @@ def _places(p_imu: Points, tree: IkdTree, arcs: _Arcs) -> list[Place]:
         if T is not None and _within(T, starts[k], _STRAYED, _STRAYED_TURN):
             carried.append((mean_distance(rough, target, T, _CLOSE, config), T))
     carried.sort(key=lambda one: one[0])
-    found = [place for T in [*_distinct([T for _, T in carried])[:_LOOKED_AT], arcs.pose(0.0)] for place in laid(T)]
+    looked_at = [*_distinct([T for _, T in carried], lambda T: T)[:_LOOKED_AT], arcs.pose(0.0)]
+    found = [place for T in looked_at for place in laid(T)]
     for best in sorted(found, key=lambda place: place.distance)[:1]:
         asides = [se3.exp(sign * twist) for twist in best.open for sign in (-_ASTRAY, _ASTRAY)]
         found += [place for aside in asides for place in laid(se3.compose(best.T_world_imu, aside))]
     found = sorted((place for place in found if arcs.is_near(place.T_world_imu)), key=lambda place: place.distance)
-    kept = _distinct([place.T_world_imu for place in found])
-    return [place for place in found if any(place.T_world_imu is T for T in kept)]
+    return _distinct(found, lambda place: place.T_world_imu)
 
 
 def _seen_from_imu(p_lidar: Points, x: Floats) -> Points:
@@ -165,7 +170,8 @@ class Resumption:
 
 def usual_distance(p_lidar: Points, x: Floats, tree: IkdTree) -> float:
     """`Place.distance` [m] of the thinned points (n, 3) of a scan that lies where it belongs, at the state (36,) of its end."""
-    return float(_distances(_spread(_seen_from_imu(p_lidar, x), _POINTS), tree, _Arcs(x, 1.0).pose(0.0, 0.0))[0].mean())
+    T_world_imu = np.concatenate([quaternion.from_matrix(x[R : R + 9].reshape(3, 3)), x[P : P + 3]])
+    return float(_distances(spread(_seen_from_imu(p_lidar, x), _POINTS), tree, T_world_imu)[0].mean())
 
 
 def resumption(
@@ -311,12 +317,12 @@ class _Arcs:
         return chord
 
 
-def _distinct(poses: Sequence[Floats]) -> list[Floats]:
-    """Of those (7,) that are near to each other the first."""
-    kept: list[Floats] = []
-    for T in poses:
-        if not any(_within(T, other, _SAME, _SAME_TURN) for other in kept):
-            kept.append(T)
+def _distinct(found: Sequence[Found], pose: Callable[[Found], Floats]) -> list[Found]:
+    """Of those whose poses (7,) are near to each other the first."""
+    kept: list[Found] = []
+    for own in found:
+        if not any(_within(pose(own), pose(other), _SAME, _SAME_TURN) for other in kept):
+            kept.append(own)
     return kept
 
 
@@ -328,7 +334,3 @@ def _within(A: Floats, B: Floats, apart: float, turned: float) -> bool:
 def _turned(A: Floats, B: Floats) -> float:
     """The angle between two poses (7,) [rad]."""
     return float(np.linalg.norm(se3.log(se3.compose(se3.inverse(A), B))[:3]))
-
-
-def _spread(points: Points, count: int) -> Points:
-    return np.ascontiguousarray(points[:: max(len(points) // count, 1)])
