@@ -203,22 +203,19 @@ class _Run:
             told.insert(0, LEFT_IN_PLACE)
         told += pairs_without_maps(*self._decided, len(correction.time_ns))
         told += objections_to_forced(outcome.loops)
-        doubt = doubt_of_odometry(odometry, earth) or outcome.doubt
         write_corrected_trajectory(own, outcome.placed, is_closed=bool(outcome.accepted))
         if earth is not None:
             write_graph(own.graph, outcome)
             write_georeference(own, earth, config.gnss)
             gnss = gnss_facts(self._recording.info.gnss_topic, earth, correction)
             told += gnss_warnings(earth, config.gnss)
-            if earth.contradiction is not None:
-                doubt = "; ".join(filter(None, [doubt, f"positions by satellite: {earth.contradiction}"]))
         stored = write_corrected_map(own, config.map, spool, outcome.placed) if spool is not None else 0
         write_loops(own.loops, outcome.loops, np.asarray((correction.time_ns - (odometry.first_time_ns or 0)) * 1e-9))
         shift = np.linalg.norm(correction.T_map[:, 4:] - correction.T_odo[:, 4:], axis=1)
         refused = Counter(_kind(loop.refusal) for loop in outcome.loops if not loop.is_accepted)
         summary = self._facts(odometry.state).model_copy(
             update={
-                "contradiction": doubt,
+                "contradiction": doubt_of_run(odometry, outcome, earth),
                 "scans": odometry.scans,
                 "path_length_m": odometry.path_length_m,
                 "local_maps": len(correction.time_ns),
@@ -283,10 +280,15 @@ def _told_of_up(outcome: SlamOutcome, level: int | None) -> str:
     )
 
 
-def doubt_of_odometry(odometry: RunSummary, earth: Georeference | None) -> str | None:
-    """Why the odometry makes the run not to be trusted; one that did not know where it ended may know it by satellites."""
+def doubt_of_run(odometry: RunSummary, outcome: SlamOutcome, earth: Georeference | None) -> str | None:
+    """All that makes a run not to be trusted: odometry, local maps and loops, satellites; None where nothing does.
+
+    Odometry that did not know where it ended may know it by satellites.
+    """
     is_located = earth is not None and earth.fit is not None
-    return odometry.contradiction_of_sensors if is_located else odometry.contradiction
+    by_odometry = odometry.contradiction_of_sensors if is_located else odometry.contradiction
+    by_satellite = None if earth is None or earth.contradiction is None else f"positions by satellite: {earth.contradiction}"
+    return "; ".join(text for text in (by_odometry, outcome.doubt, by_satellite) if text) or None
 
 
 def _waiting(search: LoopSearch) -> Progress:

@@ -31,7 +31,7 @@ from boxplus.runs.slam.config import load_slam_config
 from boxplus.runs.slam.folder import SlamFolder, claim_slam_folder
 from boxplus.runs.slam.loop_file import pairs_without_maps, read_loop_decisions
 from boxplus.runs.slam.result import SlamResult, load_slam_result
-from boxplus.runs.slam.slam_run import doubt_of_odometry, run_slam
+from boxplus.runs.slam.slam_run import doubt_of_run, run_slam
 from boxplus.runs.slam.spool import ScanSpool, SpooledScan, read_spool
 from boxplus.runs.slam.summary import GnssFacts
 from boxplus.sensors.satellites.geodesy import EnuFrame, to_utm
@@ -155,7 +155,7 @@ def test_every_loop_is_in_the_table_and_in_the_report(finished: Finished) -> Non
 
 def test_a_path_that_nothing_showed_is_to_be_trusted_where_satellites_do(finished: Finished) -> None:
     vague, sensors = "by its own covariance the run knows its last position to 90 m only", "the clocks are apart"
-    located, refused = (cast(Georeference, SimpleNamespace(fit=fit)) for fit in (object(), None))
+    located, refused = (cast(Georeference, SimpleNamespace(fit=fit, contradiction=None)) for fit in (object(), None))
     for contradiction, unknown, earth, doubt in (
         (None, None, located, None),
         (vague, vague, None, vague),
@@ -165,7 +165,15 @@ def test_a_path_that_nothing_showed_is_to_be_trusted_where_satellites_do(finishe
         (sensors, None, located, sensors),
     ):
         odometry = finished.result.odometry.model_copy(update={"contradiction": contradiction, "unknown_position": unknown})
-        assert doubt_of_odometry(odometry, earth) == doubt
+        assert doubt_of_run(odometry, replace(finished.result.outcome, doubt=None), earth) == doubt
+
+
+def test_one_doubt_does_not_hide_another(finished: Finished) -> None:
+    odometry = finished.result.odometry.model_copy(update={"contradiction": "the clocks are apart"})
+    outcome = replace(finished.result.outcome, doubt="local maps 3 and 4 do not fit")
+    earth = cast(Georeference, SimpleNamespace(fit=None, contradiction="fixes jump"))
+    said = "the clocks are apart; local maps 3 and 4 do not fit; positions by satellite: fixes jump"
+    assert doubt_of_run(odometry, outcome, earth) == said
 
 
 def test_trajectory_and_map_are_laid_onto_the_earth(finished: Finished) -> None:
