@@ -11,6 +11,10 @@ w is the IMU's noise over the scan (prior minus last posterior covariance of the
 P A P), and n that of the map points: f N points, if N are compared in a scan, place what they bring as badly as a scan
 of theirs would be placed, with f n of covariance f A⁻¹. With d = 0, e has the covariance of the filter.
 
+A scan that was brought to its end by the prediction shows where the platform was half way, and half of w it shares with it: of
+velocities that are off, ½w; of a walk of variance Q, W(T) less its mean over the scan, of variance Q/3 and Q/2 with w itself.
+Then (I − G) w gives way to (I − G)w + Gw', of covariance (I − ½G) Q (I − ½G)ᵀ + GQGᵀ/12 for a walk, and for velocities nearly.
+
 Points that lie on one surface share what is wrong with it, and say less than as many independent ones would: v and n can be
 counted several times for that.
 
@@ -45,6 +49,7 @@ _FIRST, _MARKED = 0, 1  # the pose that errors are counted against
 _POSE = slice(0, 6)
 _MAP = slice(6, 12)
 _NOTHING = np.zeros((6, 6))
+_NO_SHIFT = np.zeros(6)
 _LEAST_SPREAD = 0.05  # rad, of the points about their mean direction
 
 
@@ -56,19 +61,31 @@ class Correction:
         gain: (6, 6) G, how the pose follows a shift of the scan against the map.
         noise: (6, 6) covariance of the pose from the noise of the points.
         alone: (6, 6) covariance of the pose from the points alone, zero along directions they do not determine.
+        alone_by_weights: (6, 6) the same as the filter has it, which goes by the weights of the points, see `plane_scatter`.
         lever_arm: root mean square distance of the points [m].
         facing: (3,) mean of the unit vectors towards the points, along the IMU's axes: short where they are all around.
+        deskewed: whether the points were brought to the end of the scan by the prediction.
     """
 
     gain: NDArray[np.float64]
     noise: NDArray[np.float64]
     alone: NDArray[np.float64]
+    alone_by_weights: NDArray[np.float64]
     lever_arm: float
     facing: NDArray[np.float64]
+    deskewed: bool = False
 
     @classmethod
     def of(
-        cls, cov: NDArray[np.float64], A: NDArray[np.float64], directions: PoseDirections, facing: NDArray[np.float64]
+        cls,
+        cov: NDArray[np.float64],
+        A: NDArray[np.float64],
+        directions: PoseDirections,
+        facing: NDArray[np.float64],
+        *,
+        scatter: float = 1.0,
+        shared_shift: NDArray[np.float64] = _NO_SHIFT,
+        deskewed: bool = False,
     ) -> Correction:
         """Of a filter.
 
@@ -76,11 +93,19 @@ class Correction:
             cov: (24, 24) after the scan.
             A: (12, 12) information of the scan as the filter took it, with the directions of the pose it determines.
             facing: as the attribute.
+            scatter: of the variance that A⁻¹ states, what the residuals of the points bear out.
+            shared_shift: (6,) a shift of the pose of one standard deviation that A has in it, and no residual shows.
+            deskewed: as the attribute.
         """
         gain = cov[_POSE][:, MEASURED] @ A
         noise = gain @ cov[MEASURED][:, _POSE]
         alone = strong_covariance(A, replace(directions, weak=~directions.measured))
-        return cls(gain[:, _POSE], noise, alone, directions.lever_arm, facing)
+
+        def borne_out(by_weights: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
+            return scatter * by_weights + (1.0 - scatter) * np.outer(shift, shift)
+
+        noise, shown = borne_out(noise, gain[:, _POSE] @ shared_shift), borne_out(alone, alone @ A[_POSE, _POSE] @ shared_shift)
+        return cls(gain[:, _POSE], noise, shown, alone, directions.lever_arm, facing, deskewed)
 
     def share_left(self, moved: NDArray[np.float64], turned: NDArray[np.float64]) -> float:
         """Of the points compared before, the share still compared after a motion of the IMU, 0 to 1.
@@ -140,11 +165,9 @@ class MapDatum:
             self._local_points *= correction.share_left(x[P : P + 3] - self._p_world_imu, turned)
         self._R_world_imu = R_world_imu
         gain, noise, alone = (_NOTHING,) * 3 if correction is None else (correction.gain, correction.noise, correction.alone)
-        brought = self._shared * self._new_share
-        _follow(
-            x, cov_prior, cov, gain, noise, alone, self._shared, brought, self._p_world_imu, self._filter, self._joint
-        )  # fmt: skip
-        self._alone = alone
+        counts, deskewed = (self._shared, self._shared * self._new_share), correction is not None and correction.deskewed
+        _follow(x, cov_prior, cov, gain, noise, alone, counts, deskewed, self._p_world_imu, self._filter, self._joint)
+        self._alone = alone if correction is None else correction.alone_by_weights
         if correction is not None:
             self._new_share = 0.0
 
@@ -194,15 +217,15 @@ def _follow(
     gain: NDArray[np.float64],
     noise: NDArray[np.float64],
     alone: NDArray[np.float64],
-    shared: float,
-    brought: float,
+    counts: tuple[float, float],
+    deskewed: bool,
     p_world_imu: NDArray[np.float64],
     before: NDArray[np.float64],
     joint: NDArray[np.float64],
 ) -> None:
     """The joint covariances (2, 12, 12), the filter's (6, 6) `before` and the position (3,), from scan to scan, in place.
 
-    `noise` and `alone` count `shared` and `brought` times; `gain`, `noise` and `alone` (6, 6) are zero where nothing corrected.
+    `noise` and `alone` count `counts` times; `gain`, `noise` and `alone` (6, 6) are zero where nothing corrected.
     """
     rotation, move, step = x[R : R + 9], np.eye(6), np.eye(12)
     prior, turned, work = np.empty((6, 6)), np.empty((6, 6)), np.empty((12, 12))
@@ -214,10 +237,15 @@ def _follow(
     added = prior - turned
     positive_part_into(added)
     _turn_into(gain, rotation, turned)
+    through, by_imu, own = np.eye(6), np.empty((6, 6)), np.zeros((6, 6))
     for i in range(6):
         for j in range(6):
             step[i, j] -= turned[i, j]
             step[i, 6 + j] = turned[i, j]
+            through[i, j] -= (0.5 if deskewed else 1.0) * turned[i, j]
+    _congruence(through, added, work, by_imu)
+    if deskewed:
+        _congruence(turned, added, work, own)
     _turn_into(noise, rotation, turned)
     _turn_into(alone, rotation, prior)
     both, moved = np.zeros((12, 12)), np.empty((12, 12))
@@ -228,12 +256,11 @@ def _follow(
         _congruence(both, joint[k], work, moved)
         for i in range(6):
             for j in range(6):
-                moved[i, j] += added[i, j]
-                moved[6 + i, 6 + j] += brought * prior[i, j]
+                moved[6 + i, 6 + j] += counts[1] * prior[i, j]
         _congruence(step, moved, work, joint[k])
         for i in range(6):
             for j in range(6):
-                joint[k, i, j] += shared * turned[i, j]
+                joint[k, i, j] += by_imu[i, j] + own[i, j] / 12.0 + counts[0] * turned[i, j]
     _turn_into(cov, rotation, before)
     for i in range(3):
         p_world_imu[i] = x[P + i]

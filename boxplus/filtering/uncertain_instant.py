@@ -34,6 +34,11 @@ class UncertainInstant:
         self._u = np.zeros(len(MEASURED))
         self._u[:6] = sigma_s * motion.ravel()
 
+    @property
+    def shift(self) -> NDArray[np.float64]:
+        """(6,) how far one standard deviation of the stamp moves the pose: [θ about the IMU's axes, p along the world's]."""
+        return self._u[:6]
+
     def at(self, x: NDArray[np.float64], *, rematch: bool) -> Information:
         """See `Measurement`."""
         exact = self._measurement.at(x, rematch=rematch)

@@ -25,6 +25,7 @@ from boxplus.filtering.plane_information import (
     USED,
     accumulate_parts,
 )
+from boxplus.filtering.plane_scatter import plane_scatter
 from boxplus.filtering.small_linalg import cholesky_inverse_into
 from boxplus.maps.curved_patches import FILLED_CELLS, MEAN_LEVERAGE, ONE_WAY, PATCH, SPARSE_CELLS, bend_planes
 from boxplus.maps.ikd_tree import IkdTree
@@ -89,6 +90,7 @@ class PlaneMeasurement:
         self._matched = False
         self._matched_at = np.zeros(PACKED)
         self._pull = np.zeros(MEASURED_DOF)
+        self._about_pose = np.zeros((6, 6))  # A of the last iterate
         self._directions: PoseDirections
         self.facing: NDArray[np.float64] = np.zeros(3)
         self.lever_arm = max(_spread_into(p_lidar, self.facing) if n else 1.0, 0.1)
@@ -118,10 +120,15 @@ class PlaneMeasurement:
             self._pull = pull
             threshold = threshold_for(self._config.weak_threshold, int(sums[0]))
             self._directions = pose_directions(A.sum(axis=0)[:6, :6], noise, self.lever_arm, threshold)
+        self._about_pose = A.sum(axis=0)[:6, :6]
         used = int(sums[0])
         rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
         A, b = A * self._weight, b * self._weight
         return Information(A.sum(axis=0), b.sum(axis=0), self._pull * self._weight, self._directions, used, rms), A, b
+
+    def scatter(self, x: NDArray[np.float64]) -> float:
+        """Of the variance that the information states, what the residuals at x (36,) bear out, 0.05 to 1: `plane_scatter`."""
+        return float(plane_scatter(x, self._p_lidar, self._planes, self._fate, self._about_pose))
 
     def has_moved(self, x: NDArray[np.float64]) -> bool:
         """Whether the points have moved far enough since the last search for some to have other neighbours."""

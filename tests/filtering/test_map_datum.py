@@ -267,5 +267,47 @@ def test_what_a_view_turns_away_from_is_compared_no_more(seed: int) -> None:
     random = np.random.default_rng(seed)
     facing, moved, turned = 0.25 * random.normal(size=3), random.normal(size=3), random.normal(size=3)
     spread = np.sqrt(max(1.0 - facing @ facing, 0.05**2))
-    left = Correction(np.eye(6), np.eye(6), np.eye(6), 5.0, facing).share_left(moved, turned)
+    left = Correction(*[np.eye(6)] * 4, 5.0, facing).share_left(moved, turned)
     assert left == pytest.approx(np.exp(-np.linalg.norm(moved) / 5.0 - np.linalg.norm(np.cross(turned, facing)) / spread))
+
+
+@given(seeds, st.floats(0.05, 1.0))
+def test_what_residuals_do_not_bear_out_is_taken_off_and_a_shared_shift_stays(seed: int, scatter: float) -> None:
+    """A = (Q⁻¹ + u uᵀ)⁻¹: points of covariance Q⁻¹, and a stamp that moves all of them by u."""
+    random = np.random.default_rng(seed)
+    shift, Q = 0.01 * random.normal(size=6), _information(random)[:6, :6]
+    A, cov = np.zeros((12, 12)), 1e-4 * np.eye(24)
+    A[:6, :6] = np.linalg.inv(np.linalg.inv(Q) + np.outer(shift, shift))
+    after = _updated(cov, A)
+    directions = pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0)
+    found = Correction.of(after, A, directions, ALL_AROUND, scatter=scatter, shared_shift=shift)
+    really = scatter * np.linalg.inv(Q) + np.outer(shift, shift)
+    np.testing.assert_allclose(found.alone, really, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found.noise, found.gain @ really @ found.gain.T, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found.alone_by_weights, np.linalg.inv(A[:6, :6]), rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("walks", [True, False])
+def test_points_brought_to_the_end_of_their_scan_by_the_prediction_share_its_error(walks: bool) -> None:
+    """Sampled: a walk within the scan, or a velocity that is off; the points, seen all along it, show the mean of what it did."""
+    random, runs, steps = np.random.default_rng(4), 20000, 40
+    x, cov = _state(np.eye(3), np.zeros(3)), 1e-8 * np.eye(24)
+    datum, e = MapDatum(x, cov), 1e-4 * random.normal(size=(runs, 6))
+    for _ in range(4):
+        A, cov_prior = _information(random), cov + 1e-4 * np.eye(24)
+        cov = _updated(cov_prior, A)
+        correction = Correction.of(
+            cov, A, pose_directions(A[:6, :6], np.eye(6), 8.0, 0.0), ALL_AROUND, scatter=0.05, deskewed=True
+        )
+        datum.follow(x, cov_prior, cov, correction)
+        noise = np.sqrt(0.05) * np.linalg.cholesky(np.linalg.inv(A[:6, :6]))
+        w, seen = np.zeros((2, runs, 6))
+        rate = 1e-2 * random.normal(size=(runs, 6))
+        for _ in range(steps):
+            w = w + (1e-2 / np.sqrt(steps) * random.normal(size=(runs, 6)) if walks else rate / steps)
+            seen += w / steps
+        G = cov[:6, :6] @ A[:6, :6]
+        e = e + w - (e + seen + random.normal(size=(runs, 6)) @ noise.T) @ G.T
+        expected, sampled = datum.pose_covariance(x), np.cov(e.T)
+        ratios = np.linalg.eigvals(np.linalg.solve(expected, sampled)).real
+        assert ratios.max() < 1.1 and ratios.min() > (0.9 if walks else 0.65)  # 1/4 of what a velocity does, 1/3 of a walk

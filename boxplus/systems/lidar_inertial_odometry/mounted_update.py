@@ -8,7 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus.filtering.iterated_update import Measurement, Posterior, iterated_update
-from boxplus.filtering.map_datum import SHARED_ERRORS
+from boxplus.filtering.map_datum import SHARED_ERRORS, Correction
+from boxplus.filtering.nav_state import RL
+from boxplus.filtering.uncertain_instant import UncertainInstant
+from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import (
     MOUNTING,
@@ -37,6 +40,15 @@ class MountedUpdate:
     cov: NDArray[np.float64]
     B_prior: NDArray[np.float64]
     B: NDArray[np.float64]
+
+    def correction(self, measurement: PlaneMeasurement, stamped: UncertainInstant) -> Correction:
+        """What the scan has done to the pose, its points as far off as their residuals bear out, its stamp as far as is set."""
+        posterior, x = self.posterior, self.posterior.x
+        facing, scatter = x[RL : RL + 9].reshape(3, 3) @ measurement.facing, measurement.scatter(x)
+        directions = posterior.last.directions
+        return Correction.of(
+            self.cov, posterior.A, directions, facing, scatter=scatter, shared_shift=stamped.shift, deskewed=True
+        )
 
 
 def mounted_update(

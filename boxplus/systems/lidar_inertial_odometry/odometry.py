@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from boxplus._arguments import as_settings
 from boxplus._stopwatch import Stopwatch
-from boxplus.filtering.map_datum import SHARED_ERRORS, Correction, MapDatum
-from boxplus.filtering.nav_state import RL, TANGENT, NavState, P, V
+from boxplus.filtering.map_datum import SHARED_ERRORS, MapDatum
+from boxplus.filtering.nav_state import TANGENT, NavState, P, V
 from boxplus.filtering.propagation import NODE, propagate_interval
 from boxplus.filtering.uncertain_instant import UncertainInstant
 from boxplus.maps.first_arrivals import FirstArrivals
@@ -266,8 +266,7 @@ class LidarInertialOdometry(Snapshots):
         taken = posterior.valid and not self._is_astray(frame, on_map)
         if taken:
             self._x, self._cov = posterior.x, posterior.cov
-        facing = self._x[RL : RL + 9].reshape(3, 3) @ measurement.facing
-        correction = Correction.of(update.cov, posterior.A, posterior.last.directions, facing) if taken else None
+        correction = update.correction(measurement, stamped) if taken else None
         self._datum.follow(self._x, cov_prior, update.cov if taken else cov_prior, correction)
         if self._mounting_drift is not None:
             after = self._x, update.B if taken else update.B_prior

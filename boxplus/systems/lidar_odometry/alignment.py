@@ -122,7 +122,8 @@ def align(
     cov = cov + np.outer(moved, moved)
     expected += np.outer(moved[_LAST_POSE], moved[_LAST_POSE])
     alone = strong_covariance(said.A, said.directions)
-    correction = Correction(gain, noise, alone, said.directions.lever_arm, measurement.facing)
+    scatter = measurement.scatter(x)
+    correction = Correction(gain, scatter * noise, scatter * alone, alone, said.directions.lever_arm, measurement.facing)
     return Alignment(motion, cov, True, said, measurement, expected, correction, steps, converged)
 
 

@@ -18,8 +18,8 @@ from boxplus.systems.lidar_inertial_odometry.watches.long_baseline import Drift,
 IMU_KNOWN = np.zeros((18, 6))  # the IMU's pose does not move with the mounting: what is placed does
 POINTS, SIGMA_M = 900, 0.01
 SPREAD = np.repeat([np.deg2rad(1.0), 0.03], 3)  # of a mounting, rad and m
-NO_GAIN = Correction(np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), 1.0, np.zeros(3))
-LIDAR_KNOWN = Correction(np.eye(6), np.zeros((6, 6)), np.zeros((6, 6)), 1.0, np.zeros(3))
+NO_GAIN = Correction(np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), 1.0, np.zeros(3))
+LIDAR_KNOWN = Correction(np.eye(6), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), 1.0, np.zeros(3))
 
 
 def transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
