@@ -36,6 +36,9 @@ class LocalizationConfig(Settings):
     least_lead: float = Field(
         0.23, ge=0, lt=1, description="part by which what stands is less far off the map's surfaces than at any other pose, mean"
     )
+    lead_margin: float = Field(
+        0.06, ge=0, description="and over the root of the number of queries so much more, before the place is told from its kind"
+    )
     track_interval: float = Field(0.3, ge=0, description="time between registrations of a scan to the map [s]")
     track_voxel: float = Field(0.5, gt=0, description="voxel that thins a scan for it [m]")
     track_points: int = Field(1000, ge=100, description="points of a scan for it, at most")

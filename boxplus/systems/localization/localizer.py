@@ -34,26 +34,24 @@ from boxplus.systems.localization.candidate import (
     rivalry,
 )
 from boxplus.systems.localization.config import LocalizationConfig
-from boxplus.systems.localization.global_search import Guess, PlaceImages, same_pose
+from boxplus.systems.localization.global_search import Guess, PlaceImages
+from boxplus.systems.localization.kind import Kind, same_place
 from boxplus.systems.localization.map_lengths import MapLengths
+from boxplus.systems.localization.map_tilt import MapTilt
 from boxplus.systems.localization.place_map import PlaceMap
+from boxplus.systems.localization.standing import level, up_in_body
 from boxplus.systems.localization.stays import Stays
 from boxplus.systems.localization.tracking import Matched, Tracker
 
 Floats = NDArray[np.float64]
 Status = Literal["localised", "odometry only", "searching"]
 
-_AGREE = 1.0, np.deg2rad(5.0), 1.0  # m, rad, m: two queries that say the same, the odometry between them
 _QUERY_RANGE = 60.0  # m
 _STILL = 1.0  # s after a registration was taken that a pose is localised, where no later one failed
 _HERE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _REMEMBERED = 4  # poses that fitted a query
 _NEVER = -(2**62)
 _CONTRADICTIONS = 2  # in a row, after which the place is another one
-_ANOTHER = (
-    "a place of the same kind, perhaps another one: what stands lies {:.0f} % nearer to surfaces of the map than at any other "
-    "pose, {:.0f} % asked for"
-)
 _JUMP_S = 2.0  # between scans, after which nothing is known of the motion between
 
 
@@ -113,7 +111,8 @@ class Localizer:
         last_search: the newest query; last_query: what it asked for, None before one had points.
         losses: how often the place was lost; lost_because: why last, None before it was.
         stays: whether the places agree with each other.
-        lengths: whether the map has the lengths that are seen.
+        kind: whether the place is told from others of its kind.
+        lengths: whether the map has the lengths that are seen; tilt: whether it stands upright.
 
     Example: docs/localization.md.
     """
@@ -125,14 +124,13 @@ class Localizer:
         self.lost_because: str | None = None
         self.losses = 0
         self.stays = Stays()
-        self.lengths = MapLengths()
+        self.kind = Kind(self.config.least_lead, self.config.lead_margin)
+        self.lengths, self.tilt = MapLengths(), MapTilt()
         self._map = place_map
         self._images = PlaceImages(place_map.local_maps)
         self._tracker: Tracker | None = None
         self._before: tuple[int, Floats] | None = None
         self._promising: Floats | None = None  # T_map_odo of the query before, where it was nearly believed
-        self._leads: list[float] = []  # of the same place, in the queries up to the one before
-        self._leading: Floats | None = None  # T_map_odo of that place
         self._earlier: list[tuple[int, Floats]] = []  # place and T_map_odo of what fitted the query before
         self._held_ns = self._fitting_ns = self._tried_ns = self._failures = 0
         self._again_ns, self._again_s = 0, 0.0  # when it is looked for again, and how long after the time before
@@ -144,7 +142,8 @@ class Localizer:
     @property
     def doubt(self) -> str | None:
         """Why poses that were given out are not to be trusted; None where nothing speaks against them."""
-        return "; ".join(text for text in (self.stays.doubt, self.lengths.doubt) if text) or None
+        parts = (self.stays, self.kind, self.lengths, self.tilt)
+        return "; ".join(part.doubt for part in parts if part.doubt is not None) or None
 
     def push(
         self,
@@ -181,6 +180,7 @@ class Localizer:
             self._lose(f"no scan for {seconds:.1f} s", is_contradicted=False)
         if seconds > _JUMP_S or lost:
             self.stays.jump()
+            self.kind.forget()
         self._before = int(time_ns), T_odo
         self.stays.walk(float(np.linalg.norm(step[4:])))
         self.lengths.walk(float(np.linalg.norm(step[4:])))
@@ -240,22 +240,17 @@ class Localizer:
             return "nothing that was seen stands, or none of it agrees with the map"
         best, verdict, at_once = rivalry(candidates, self.config)
         if best is None:
-            self._promising = self._leading = None
+            self._promising = None
             return verdict
         T_map_odo = se3.compose(best.T_map_query, se3.inverse(local_map.T_odo_map))
-        # Every query of a place is counted, also those that are not believed: the lead of one varies by a third of itself.
-        if self._leading is None or not self._agree(self._leading, T_map_odo, local_map.T_odo_map):
-            self._leads = []
-        self._leads.append(lead(best, candidates))
-        self._leading = T_map_odo
-        if not verdict and (mean := float(np.mean(self._leads))) < self.config.least_lead:
-            verdict = _ANOTHER.format(100.0 * mean, 100.0 * self.config.least_lead)
+        self.kind.see(lead(best, candidates), T_map_odo, local_map.T_odo_map)  # also of those that are not believed
+        verdict = verdict or self.kind.refusal or ""
         if verdict:
             self._promising = None
             return verdict
         if not at_once:
             before, self._promising = self._promising, T_map_odo
-            if before is None or not self._agree(before, T_map_odo, local_map.T_odo_map):
+            if before is None or not same_place(before, T_map_odo, local_map.T_odo_map):
                 return (
                     f"not {self.config.decisive:g} times as good as the next place: a second query has to agree, of "
                     f"{self.config.query_duration:g} s or {self.config.query_length:g} m more"
@@ -266,14 +261,10 @@ class Localizer:
         self._held_ns = self._fitting_ns = local_map.end_ns
         self._failures, self._is_odometry_lost = 0, False
         self.stays.begin(local_map.end_ns, T_map_odo, se3.compose(local_map.T_odo_map, T_query_body))
-        self._again_ns = local_map.end_ns + int(1e9 * self._again_s)
+        self.kind.follow()
+        self._again_ns = local_map.end_ns + (int(1e9 * self._again_s) if self.kind.is_told else 0)
         self._builder = self._new_builder()
         return ""
-
-    @staticmethod
-    def _agree(first: Floats, second: Floats, T_odo: Floats) -> bool:
-        """Whether two T_map_odo put the odometry's pose at the same place."""
-        return same_pose(se3.compose(first, T_odo), se3.compose(second, T_odo), *_AGREE)
 
     def _follow(
         self, tracker: Tracker, time_ns: int, T_odo: Floats, points: NDArray[np.float32], up: Floats | None, lost: bool
@@ -284,10 +275,13 @@ class Localizer:
         if not lost and len(points) and (time_ns - self._tried_ns) * 1e-9 >= config.track_interval:
             self._tried_ns = time_ns
             is_due = self.lengths.is_due
-            matched = tracker.correct(points, _level(T_odo, up, tracker.T_map_body), with_lengths=is_due)
+            up_body = quaternion.to_matrix(tracker.T_map_body[:4])[2] if up is None else up_in_body(T_odo, up)
+            matched = tracker.correct(points, level(up_body), with_lengths=is_due)
             self._failures = self._failures + 1 if matched.innovation > matched.limit else 0
             if is_due and matched.measured:
                 self.lengths.see(matched.lengths)
+            if up is not None and matched.measured == 6:
+                self.tilt.see(quaternion.to_matrix(tracker.T_map_body[:4]) @ up_body)
             # One that fails ends it at once: a sensor that was carried away is not where the odometry has it.
             self._held_ns = time_ns if matched.measured else _NEVER
             # At the map's end what it still has near is seen as it is; elsewhere than that the place is another one.
@@ -318,12 +312,17 @@ class Localizer:
         near = [float(np.linalg.norm(place.T_odo_map[4:] - T_map_query[4:])) for place in self._map.local_maps]
         candidates = self._candidates(queries[0], T_query_body, points, [Guess(int(np.argmin(near)), T_map_query, 0.0)])
         why = contradiction(candidates[0], candidates[1:], T_map_query, config)
+        if candidates[0].refusal is None and not self.kind.is_told:
+            T_map_odo = se3.compose(tracker.T_map_body, se3.inverse(T_odo))
+            self.kind.see(lead(candidates[0], candidates[1:]), T_map_odo, T_odo)
+            why = why or self.kind.refusal
         self._builder = self._new_builder()
         self._contradictions = self._contradictions + 1 if why else 0
         self.stays.is_confirmed = why is None and (candidates[0].refusal is None or self.stays.is_confirmed)
         if why is None:
             self._again_ns = time_ns + int(1e9 * self._again_s)
-            self._again_s = min(2.0 * self._again_s, config.recheck_interval)
+            if self.kind.is_told:
+                self._again_s = min(2.0 * self._again_s, config.recheck_interval)
         self._contradicted_by = why
         self.last_search = Search(time_ns, tuple(candidates), why or "")
         return self.last_search
@@ -356,8 +355,7 @@ class Localizer:
         config = self.config
         self._tracker = None
         self.lengths.begin()
-        self._promising = self._leading = None
-        self._leads = []
+        self._promising = None
         self._earlier = []
         self._held_ns = self._fitting_ns = self._tried_ns = self._failures = 0
         self._again_s, self._again_ns = config.recheck_after, 0
@@ -376,15 +374,3 @@ class Localizer:
             ),  # type: ignore[call-arg]
             looks_anew=True,  # an odometry of a LiDAR alone drifts while it is searched
         )
-
-
-def _level(T_odo_body: Floats, up_odo: Floats | None, T_map_body: Floats) -> Floats:
-    """(3, 3) to a frame whose z is up, whatever its x: as the odometry has it, or the map, which stands upright."""
-    if up_odo is None:
-        z = quaternion.to_matrix(T_map_body[:4])[2]
-    else:
-        z = quaternion.to_matrix(T_odo_body[:4]).T @ (up_odo / np.linalg.norm(up_odo))
-    x = np.eye(3)[int(np.argmin(np.abs(z)))]
-    x = x - z * (z @ x)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z])
