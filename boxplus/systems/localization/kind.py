@@ -59,9 +59,10 @@ class Kind:
         """Why poses that were given out may be those of another place of the kind; None where nothing says so."""
         if self._left is not None or not self._is_followed or self.is_told:
             return self._left
+        queries = f"{len(self._leads)} {either(len(self._leads), 'query', 'queries')}"
         return (
-            f"the place may be another one of the same kind: over {len(self._leads)} {either(len(self._leads), 'query', 'queries')} {self._nearer} "
-            f"at any other pose, and {self._percent} of it is what other places of a kind come to; a longer way tells"
+            f"the place may be another one of the same kind: over {queries} {self._nearer} at any other pose, other places of "
+            f"a kind come to {self._percent}; a longer way tells"
         )
 
     def see(self, lead: float, T_map_odo: Floats, T_odo: Floats) -> None:

@@ -142,8 +142,10 @@ class Localizer:
     @property
     def doubt(self) -> str | None:
         """Why poses that were given out are not to be trusted; None where nothing speaks against them."""
-        parts = (self.stays, self.kind, self.lengths, self.tilt)
-        return "; ".join(part.doubt for part in parts if part.doubt is not None) or None
+        texts = [part.doubt for part in (self.stays, self.kind, self.lengths, self.tilt)]
+        if self._contradictions and not self.kind.doubt:
+            texts.append(f"the place that is followed may be a wrong one: in the newest search {self._contradicted_by}")
+        return "; ".join(text for text in texts if text is not None) or None
 
     def push(
         self,
@@ -180,7 +182,8 @@ class Localizer:
             self._lose(f"no scan for {seconds:.1f} s", is_contradicted=False)
         if seconds > _JUMP_S or lost:
             self.stays.jump()
-            self.kind.forget()
+            if self._tracker is None:
+                self.kind.forget()
         self._before = int(time_ns), T_odo
         self.stays.walk(float(np.linalg.norm(step[4:])))
         self.lengths.walk(float(np.linalg.norm(step[4:])))

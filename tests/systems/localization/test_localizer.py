@@ -152,6 +152,42 @@ def test_another_warehouse_with_the_same_racks_is_not_taken_for_the_one_of_the_m
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("lead_margin", "is_told"), [(0.0, True), (0.9, False)])
+def test_a_place_is_asked_again_until_it_is_told_from_its_kind(
+    world: World, place_map: KnownMap, lead_margin: float, is_told: bool
+) -> None:
+    config = LocalizationConfig(candidates=5, query_duration=1.5, lead_margin=lead_margin)
+    drive = drive_of(world, [[14, 1.5], [2, 1.5]], seed=5)
+    localizer = Localizer(place_map, config)
+    found = push_all(localizer, drive, own_world(drive))
+    begin = next(k for k, one in enumerate(found) if one.T_map_body is not None)
+    assert localizer.losses == 0 and "searching" not in [one.status for one in found[begin:]]  # nothing is taken back
+    again = [one.time_ns - found[begin].time_ns for one in found[begin + 1 :] if one.search is not None]
+    assert bool(again and again[0] < 3e9) != is_told
+    assert localizer.kind.is_told == is_told and (localizer.doubt is None) == is_told
+    assert is_told or "may be another one of the same kind: over " in str(localizer.doubt)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lean_deg", [1.0, 2.5, -4.0])
+def test_a_map_that_leans_is_named(world: World, place_map: KnownMap, lean_deg: float) -> None:
+    """Once poses in it were given without a word: registration has all six directions."""
+    T_lean = se3.exp(np.radians([0.8 * lean_deg, 0.6 * lean_deg, 0.0, 0.0, 0.0, 0.0]))
+    places = [replace(m, T_odo_map=se3.compose(T_lean, m.T_odo_map)) for m in place_map.local_maps]
+    points = se3.act(T_lean, place_map.points.astype(np.float64)).astype(np.float32)
+    drive = drive_of(world, [[14, 1.5], [0, 1.5]], seed=5)
+    T_odo, ends = own_world(drive), []
+    for up in ((0.0, 0.0, 1.0), None):  # without an IMU nobody can tell
+        localizer = Localizer(KnownMap(places, points), FEW)
+        found = push_all(localizer, drive, T_odo, up_odo=up)
+        xi = errors(found, replace(drive, T_world_body=se3.compose(T_lean, drive.T_world_body)))
+        assert len(xi) > 5 and np.linalg.norm(xi[:, 3:], axis=1).max() < 0.1
+        ends.append(localizer.tilt)
+    assert np.rad2deg(ends[0].angle) == pytest.approx(abs(lean_deg), abs=0.2) and ends[1].angle == 0.0
+    assert (ends[0].doubt is not None) == (abs(lean_deg) > 1.5) and ends[1].doubt is None
+
+
+@pytest.mark.slow
 def test_a_place_that_fits_as_one_alike_does_is_noticed_to_be_another_one() -> None:
     place_map = known_map(warehouse(seed=31), [[-12, 0], [12, 0]], INDOORS, seed=31)
     bay, drive = 2.8, drive_of(warehouse(seed=31), [[-8, 0.4], [-4.5, 0.4]], seed=5)
@@ -165,8 +201,15 @@ def test_a_place_that_fits_as_one_alike_does_is_noticed_to_be_another_one() -> N
         )
         localizer = Localizer(place_map, config)
         assert push_all(localizer, drive, own_world(drive))[-1].status == "localised" and localizer.losses == 0
-        found = push_all(localizer, after, T_odo, int(drive.time_ns[-1]) + 300_000_000)
+        rows, begin, found, doubts = zip(after.time_ns, T_odo, after.scans, strict=True), int(drive.time_ns[-1]), [], []
+        for time_ns, T, scan in rows:
+            found.append(localizer.push(begin + 300_000_000 + int(time_ns), T, scan))
+            doubts.append(localizer.doubt)
         ends.append([one.status for one in found])
+        if recheck_after:  # a recording may end as soon as the first search contradicts
+            first = next(k for k, one in enumerate(found) if one.search is not None and one.search.verdict)
+            assert localizer.losses == 1 and "searching" not in ends[-1][: first + 1]
+            assert "may be" in str(doubts[first])
     assert set(ends[0]) == {"localised"} and "searching" in ends[1]
     assert "localised" not in ends[1][5 : ends[1].index("searching")]  # what is doubted is not claimed
     assert localizer.losses == 1 and "2 times in a row another pose" in str(localizer.lost_because)

@@ -1,0 +1,63 @@
+"""What queries in a row say of a place: believed, told from its kind, or in doubt."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from boxplus.systems.localization.kind import Kind, same_place
+
+HERE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+ELSEWHERE = HERE + np.array([0.0, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0])
+T_ODO = np.array([1.0, 0.0, 0.0, 0.0, 30.0, 5.0, 1.0])
+LEAST, MARGIN = 0.23, 0.06
+
+
+def seen(*leads: float, follow: bool = True) -> Kind:
+    kind = Kind(LEAST, MARGIN)
+    for lead in leads:
+        kind.see(lead, HERE, T_ODO)
+    if follow:
+        kind.follow()
+    return kind
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=12))
+def test_the_mean_is_believed_from_the_limit_and_told_a_margin_above(leads: list[float]) -> None:
+    kind = seen(*leads)
+    mean = float(np.mean(leads))
+    assert kind.mean == pytest.approx(mean)
+    assert (kind.refusal is None) == (kind.mean >= LEAST)
+    assert kind.is_told == (kind.mean >= LEAST + MARGIN / math.sqrt(len(leads)))
+    assert (kind.doubt is None) == kind.is_told
+    assert seen(*leads, follow=False).doubt is None  # no pose was given out
+
+
+def test_the_same_lead_tells_after_more_queries() -> None:
+    assert not seen(0.26).is_told and not seen(0.26, 0.26).is_told and seen(*[0.26] * 5).is_told
+    text = seen(0.25, 0.25).doubt
+    assert text is not None and "over 2 queries what stands lies 25 % nearer" in text and "come to 23 %" in text
+    assert "perhaps another one: what stands lies 20 % nearer" in str(seen(0.2).refusal)
+
+
+def test_another_place_begins_anew_and_the_doubt_of_the_first_stays() -> None:
+    kind = seen(0.25, 0.25)
+    kind.see(0.5, ELSEWHERE, T_ODO)
+    kind.follow()
+    assert kind.is_told and kind.mean == 0.5 and "over 2 queries" in str(kind.doubt)
+    told = seen(0.5)
+    told.see(0.1, ELSEWHERE, T_ODO)
+    assert told.mean == 0.1 and told.doubt is None
+    told.forget()
+    assert told.mean == 0.0 and told.doubt is None and not told.is_told
+
+
+def test_a_place_is_the_same_where_the_odometry_is_and_not_at_its_origin() -> None:
+    turn = math.radians(3.0)
+    turned = np.array([math.cos(0.5 * turn), 0.0, 0.0, math.sin(0.5 * turn), 0.0, 0.0, 0.0])
+    assert same_place(HERE, turned, HERE) and not same_place(HERE, turned, T_ODO)
+    assert same_place(HERE, HERE, T_ODO) and not same_place(HERE, ELSEWHERE, HERE)
