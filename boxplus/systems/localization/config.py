@@ -39,6 +39,7 @@ class LocalizationConfig(Settings):
     lead_margin: float = Field(
         0.06, ge=0, description="and over the root of the number of queries so much more, before the place is told from its kind"
     )
+    told_fit: float = Field(0.65, ge=0, le=1, description="share of what stands, near a point of the map, before it is told")
     track_interval: float = Field(0.3, ge=0, description="time between registrations of a scan to the map [s]")
     track_voxel: float = Field(0.5, gt=0, description="voxel that thins a scan for it [m]")
     track_points: int = Field(1000, ge=100, description="points of a scan for it, at most")

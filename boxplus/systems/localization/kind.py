@@ -3,7 +3,8 @@
 Racks, columns and walls fit wherever there are such, also in the map of another hall built alike. The lead of a place over its
 rivals in one query (`candidate.lead`) varies by a third of itself: its mean over the queries in a row that came to the place has
 to reach a limit before a pose is given, and to exceed it by what so few queries may be off before the place is told. Until then
-it is asked again while it is followed, and a run that ends before it was told says so. Derivation: docs/localization.md.
+it is asked again while it is followed, and a run that ends before it was told says so. Where much of what stands is nowhere in
+the map, its rivals may only lie farther beyond the map's end: that tells nothing. Derivation: docs/localization.md.
 """
 
 from __future__ import annotations
@@ -28,11 +29,13 @@ class Kind:
     Args:
         least: mean lead, of a place that is believed at all.
         margin: and so much more over the root of the number of queries, of one that is told.
+        least_fit: mean share of what stands that is in the map, of one that is told.
     """
 
-    def __init__(self, least: float, margin: float) -> None:
-        self._least, self._margin = least, margin
+    def __init__(self, least: float, margin: float, least_fit: float) -> None:
+        self._least, self._margin, self._least_fit = least, margin, least_fit
         self._leads: list[float] = []
+        self._fits: list[float] = []
         self._T_map_odo: Floats | None = None
         self._is_followed = False  # poses in this place were given out
         self._left: str | None = None  # doubt of an earlier place, which was left before it was told
@@ -45,7 +48,9 @@ class Kind:
     @property
     def is_told(self) -> bool:
         """Whether the place is told from others of its kind."""
-        return bool(self._leads) and self.mean >= self._least + self._margin / math.sqrt(len(self._leads))
+        if not self._leads or np.mean(self._fits) < self._least_fit:
+            return False
+        return self.mean >= self._least + self._margin / math.sqrt(len(self._leads))
 
     @property
     def refusal(self) -> str | None:
@@ -60,16 +65,18 @@ class Kind:
         if self._left is not None or not self._is_followed or self.is_told:
             return self._left
         queries = f"{len(self._leads)} {either(len(self._leads), 'query', 'queries')}"
+        missing = f"{100.0 * (1.0 - np.mean(self._fits)):.0f} % of it"
         return (
             f"the place may be another one of the same kind: over {queries} {self._nearer} at any other pose, other places of "
-            f"a kind come to {self._percent}; a longer way tells"
+            f"a kind come to {self._percent}, and {missing} is nowhere in the map; a longer way tells"
         )
 
-    def see(self, lead: float, T_map_odo: Floats, T_odo: Floats) -> None:
+    def see(self, lead: float, fit: float, T_map_odo: Floats, T_odo: Floats) -> None:
         """A query that came to a place, believed or not: T_map_odo (7,), where the odometry is at T_odo (7,)."""
         if self._T_map_odo is None or not same_place(self._T_map_odo, T_map_odo, T_odo):
             self.forget()
         self._leads.append(lead)
+        self._fits.append(fit)
         self._T_map_odo = T_map_odo
 
     def follow(self) -> None:
@@ -79,7 +86,7 @@ class Kind:
     def forget(self) -> None:
         """The next query is of another place, or nobody knows of which."""
         self._left = self.doubt
-        self._leads, self._T_map_odo, self._is_followed = [], None, False
+        self._leads, self._fits, self._T_map_odo, self._is_followed = [], [], None, False
 
     @property
     def _nearer(self) -> str:

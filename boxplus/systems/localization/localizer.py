@@ -124,7 +124,7 @@ class Localizer:
         self.lost_because: str | None = None
         self.losses = 0
         self.stays = Stays()
-        self.kind = Kind(self.config.least_lead, self.config.lead_margin)
+        self.kind = Kind(self.config.least_lead, self.config.lead_margin, self.config.told_fit)
         self.lengths, self.tilt = MapLengths(), MapTilt()
         self._map = place_map
         self._images = PlaceImages(place_map.local_maps)
@@ -246,7 +246,7 @@ class Localizer:
             self._promising = None
             return verdict
         T_map_odo = se3.compose(best.T_map_query, se3.inverse(local_map.T_odo_map))
-        self.kind.see(lead(best, candidates), T_map_odo, local_map.T_odo_map)  # also of those that are not believed
+        self.kind.see(lead(best, candidates), best.fit, T_map_odo, local_map.T_odo_map)  # also of those that are not believed
         verdict = verdict or self.kind.refusal or ""
         if verdict:
             self._promising = None
@@ -317,7 +317,7 @@ class Localizer:
         why = contradiction(candidates[0], candidates[1:], T_map_query, config)
         if candidates[0].refusal is None and not self.kind.is_told:
             T_map_odo = se3.compose(tracker.T_map_body, se3.inverse(T_odo))
-            self.kind.see(lead(candidates[0], candidates[1:]), T_map_odo, T_odo)
+            self.kind.see(lead(candidates[0], candidates[1:]), candidates[0].fit, T_map_odo, T_odo)
             why = why or self.kind.refusal
         self._builder = self._new_builder()
         self._contradictions = self._contradictions + 1 if why else 0

@@ -14,13 +14,13 @@ from boxplus.systems.localization.kind import Kind, same_place
 HERE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 ELSEWHERE = HERE + np.array([0.0, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0])
 T_ODO = np.array([1.0, 0.0, 0.0, 0.0, 30.0, 5.0, 1.0])
-LEAST, MARGIN = 0.23, 0.06
+LEAST, MARGIN, LEAST_FIT = 0.23, 0.06, 0.65
 
 
-def seen(*leads: float, follow: bool = True) -> Kind:
-    kind = Kind(LEAST, MARGIN)
+def seen(*leads: float, follow: bool = True, fit: float = 0.9) -> Kind:
+    kind = Kind(LEAST, MARGIN, LEAST_FIT)
     for lead in leads:
-        kind.see(lead, HERE, T_ODO)
+        kind.see(lead, fit, HERE, T_ODO)
     if follow:
         kind.follow()
     return kind
@@ -44,13 +44,22 @@ def test_the_same_lead_tells_after_more_queries() -> None:
     assert "perhaps another one: what stands lies 20 % nearer" in str(seen(0.2).refusal)
 
 
+def test_a_place_half_beyond_the_map_is_not_told_by_any_lead() -> None:
+    """Its rivals lie farther beyond the map's end: that is no evidence."""
+    kind = seen(0.6, 0.6, fit=0.6)
+    assert kind.refusal is None and not kind.is_told and "40 % of it is nowhere in the map" in str(kind.doubt)
+    for _ in range(2):
+        kind.see(0.6, 0.8, HERE, T_ODO)
+    assert kind.is_told and kind.doubt is None  # once the way led into it
+
+
 def test_another_place_begins_anew_and_the_doubt_of_the_first_stays() -> None:
     kind = seen(0.25, 0.25)
-    kind.see(0.5, ELSEWHERE, T_ODO)
+    kind.see(0.5, 0.9, ELSEWHERE, T_ODO)
     kind.follow()
     assert kind.is_told and kind.mean == 0.5 and "over 2 queries" in str(kind.doubt)
     told = seen(0.5)
-    told.see(0.1, ELSEWHERE, T_ODO)
+    told.see(0.1, 0.9, ELSEWHERE, T_ODO)
     assert told.mean == 0.1 and told.doubt is None
     told.forget()
     assert told.mean == 0.0 and told.doubt is None and not told.is_told
