@@ -52,7 +52,9 @@ class LocalizationConfig(Settings):
     failures: int = Field(10, ge=1, description="registrations in a row that do not, after which the place is lost")
     least_share: float = Field(0.5, ge=0, le=1, description="share of what stands that is in the map, where there is a map")
     lost_after: float = Field(2.0, gt=0, description="time below it after which the place is lost [s]")
-    recheck_after: float = Field(5.0, ge=0, description="time after which a place is looked for again; 0: never [s]")
+    recheck_after: float = Field(
+        5.0, ge=0, description="time after which a place is looked for again; 0: never, also where it is not told [s]"
+    )
     recheck_interval: float = Field(
         120.0, gt=0, description="twice as late each time, up to this; at once where contradicted [s]"
     )

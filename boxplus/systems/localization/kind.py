@@ -39,6 +39,7 @@ class Kind:
         self._T_map_odo: Floats | None = None
         self._is_followed = False  # poses in this place were given out
         self._left: str | None = None  # doubt of an earlier place, which was left before it was told
+        self._left_at: Floats | None = None  # T_map_odo of that one
 
     @property
     def mean(self) -> float:
@@ -75,9 +76,15 @@ class Kind:
         """A query that came to a place, believed or not: T_map_odo (7,), where the odometry is at T_odo (7,)."""
         if self._T_map_odo is None or not same_place(self._T_map_odo, T_map_odo, T_odo):
             self.forget()
+        self.see_again(lead, fit, T_map_odo, T_odo)
+
+    def see_again(self, lead: float, fit: float, T_map_odo: Floats, T_odo: Floats) -> None:
+        """A query of the place that is followed, however far the odometry has drifted since the one before."""
         self._leads.append(lead)
         self._fits.append(fit)
         self._T_map_odo = T_map_odo
+        if self.is_told and self._left_at is not None and same_place(self._left_at, T_map_odo, T_odo):
+            self._left = self._left_at = None  # it was the same place, after all
 
     def follow(self) -> None:
         """Poses in this place are given out from now on."""
@@ -85,7 +92,8 @@ class Kind:
 
     def forget(self) -> None:
         """The next query is of another place, or nobody knows of which."""
-        self._left = self.doubt
+        if self._left is None:
+            self._left, self._left_at = self.doubt, self._T_map_odo
         self._leads, self._fits, self._T_map_odo, self._is_followed = [], [], None, False
 
     @property

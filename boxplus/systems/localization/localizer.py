@@ -39,9 +39,9 @@ from boxplus.systems.localization.kind import Kind, same_place
 from boxplus.systems.localization.map_lengths import MapLengths
 from boxplus.systems.localization.map_tilt import MapTilt
 from boxplus.systems.localization.place_map import PlaceMap
-from boxplus.systems.localization.standing import level, up_in_body
 from boxplus.systems.localization.stays import Stays
 from boxplus.systems.localization.tracking import Matched, Tracker
+from boxplus.systems.localization.upright import level, up_in_body
 
 Floats = NDArray[np.float64]
 Status = Literal["localised", "odometry only", "searching"]
@@ -143,7 +143,7 @@ class Localizer:
     def doubt(self) -> str | None:
         """Why poses that were given out are not to be trusted; None where nothing speaks against them."""
         texts = [part.doubt for part in (self.stays, self.kind, self.lengths, self.tilt)]
-        if self._contradictions and not self.kind.doubt:
+        if self._contradictions and self._contradicted_by != self.kind.refusal:
             texts.append(f"the place that is followed may be a wrong one: in the newest search {self._contradicted_by}")
         return "; ".join(text for text in texts if text is not None) or None
 
@@ -315,10 +315,10 @@ class Localizer:
         near = [float(np.linalg.norm(place.T_odo_map[4:] - T_map_query[4:])) for place in self._map.local_maps]
         candidates = self._candidates(queries[0], T_query_body, points, [Guess(int(np.argmin(near)), T_map_query, 0.0)])
         why = contradiction(candidates[0], candidates[1:], T_map_query, config)
-        if candidates[0].refusal is None and not self.kind.is_told:
+        if why is None and candidates[0].refusal is None and not self.kind.is_told:
             T_map_odo = se3.compose(tracker.T_map_body, se3.inverse(T_odo))
-            self.kind.see(lead(candidates[0], candidates[1:]), candidates[0].fit, T_map_odo, T_odo)
-            why = why or self.kind.refusal
+            self.kind.see_again(lead(candidates[0], candidates[1:]), candidates[0].fit, T_map_odo, T_odo)
+            why = self.kind.refusal
         self._builder = self._new_builder()
         self._contradictions = self._contradictions + 1 if why else 0
         self.stays.is_confirmed = why is None and (candidates[0].refusal is None or self.stays.is_confirmed)
@@ -352,12 +352,15 @@ class Localizer:
             self.stays.end(time_ns, T_map_odo, reason, is_contradicted=is_contradicted)
             self.lost_because = reason
             self.losses += 1
+        if is_contradicted:
+            self.kind.forget()
         self._begin_search()
 
     def _begin_search(self) -> None:
         config = self.config
         self._tracker = None
         self.lengths.begin()
+        self.tilt.begin()
         self._promising = None
         self._earlier = []
         self._held_ns = self._fitting_ns = self._tried_ns = self._failures = 0

@@ -16,11 +16,17 @@ _FEWEST = 5  # scans
 
 
 class MapTilt:
-    """What the scans of a run say of up in the map."""
+    """What the scans of a run say of up in the map, place by place."""
 
     def __init__(self) -> None:
         self._sum = np.zeros(3)
         self._count = 0
+        self._before: str | None = None  # doubt of an earlier place
+
+    def begin(self) -> None:
+        """The next scans are of another place."""
+        self._before = self.doubt
+        self._sum, self._count = np.zeros(3), 0
 
     def see(self, up_map: NDArray[np.float64]) -> None:
         """Take up (3,), of a scan that was registered, in the map's frame; of any length."""
@@ -36,9 +42,9 @@ class MapTilt:
     def doubt(self) -> str | None:
         """Why the map's z axis is not to be trusted; None where nothing speaks against it."""
         if self._count < _FEWEST or self.angle <= MOST_TILT:
-            return None
+            return self._before
         return (
-            f"up in the map is {np.rad2deg(self.angle):.1f}° off where the IMU has it, {np.rad2deg(MOST_TILT):.1f}° at most: the "
+            f"up in the map is {np.rad2deg(self.angle):.2f}° off where the IMU has it, {np.rad2deg(MOST_TILT):.1f}° at most: the "
             "map leans, or the LiDAR is mounted on the IMU otherwise than stated; poses lie among what the map has around, but "
             "heights and slopes are those of a map that leans"
         )

@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.manifolds import quaternion
 from boxplus.maps.local_maps.visibility import directions, nearest_ranges
 
 Floats = NDArray[np.float64]
@@ -60,16 +59,3 @@ def seen_through(scan: Points, map_stands: Points, viewpoint: Floats) -> float:
         return float("nan")
     beside = minimum_filter(measured, size=3, mode=("nearest", "wrap"))
     return float(np.mean((there < _SEEN * beside - 1.0)[asked]))
-
-
-def up_in_body(T_odo_body: Floats, up_odo: Floats) -> Floats:
-    """(3,) unit vector against gravity in the body's frame, of up (3,) in the odometry's world and the body's pose (7,) in it."""
-    return np.asarray(quaternion.to_matrix(T_odo_body[:4]).T @ (up_odo / np.linalg.norm(up_odo)))
-
-
-def level(up_body: Floats) -> Floats:
-    """(3, 3) from the body to a frame whose z is up, a unit vector (3,) in the body's frame, whatever its x."""
-    x = np.eye(3)[int(np.argmin(np.abs(up_body)))]
-    x = x - up_body * (up_body @ x)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(up_body, x), up_body])

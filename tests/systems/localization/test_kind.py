@@ -70,3 +70,20 @@ def test_a_place_is_the_same_where_the_odometry_is_and_not_at_its_origin() -> No
     turned = np.array([math.cos(0.5 * turn), 0.0, 0.0, math.sin(0.5 * turn), 0.0, 0.0, 0.0])
     assert same_place(HERE, turned, HERE) and not same_place(HERE, turned, T_ODO)
     assert same_place(HERE, HERE, T_ODO) and not same_place(HERE, ELSEWHERE, HERE)
+
+
+def test_an_odometry_that_drifts_is_still_in_the_place_that_is_followed() -> None:
+    kind = seen(0.25, 0.25)
+    for step in range(1, 8):
+        kind.see_again(0.5, 0.9, HERE + step * np.array([0.0, 0.0, 0.0, 0.0, 1.2, 0.0, 0.0]), T_ODO)
+    assert kind.is_told and kind.doubt is None
+
+
+def test_a_doubt_ends_where_the_place_is_found_again_and_told() -> None:
+    kind = seen(0.25, 0.25)
+    kind.forget()
+    assert "over 2 queries" in str(kind.doubt)
+    kind.see(0.5, 0.9, ELSEWHERE, T_ODO)
+    assert kind.is_told and kind.doubt is not None
+    kind.see(0.5, 0.9, HERE, T_ODO)
+    assert kind.is_told and kind.doubt is None

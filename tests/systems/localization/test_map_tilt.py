@@ -26,7 +26,7 @@ def test_a_doubt_takes_five_scans_and_more_than_the_limit() -> None:
     assert MapTilt().doubt is None and MapTilt().angle == 0.0
     assert seen(4, 0.1).doubt is None and seen(5, 0.99 * MOST_TILT).doubt is None
     text = seen(5, 1.01 * MOST_TILT).doubt
-    assert text is not None and text.startswith("up in the map is 1.5° off where the IMU has it")
+    assert text is not None and text.startswith("up in the map is 1.52° off where the IMU has it")
     assert "heights and slopes are those of a map that leans" in text
 
 
@@ -35,3 +35,14 @@ def test_what_sways_about_upright_is_no_lean() -> None:
     for k in range(20):
         tilt.see(np.array([np.sin(0.1), 0.0, np.cos(0.1)]) * np.array([(-1.0) ** k, 1.0, 1.0]))
     assert tilt.angle < 1e-9 and tilt.doubt is None
+
+
+def test_places_lean_by_themselves_and_the_doubt_of_one_stays() -> None:
+    tilt = seen(30, 0.07)
+    tilt.begin()
+    assert tilt.angle == 0.0 and "4.01°" in str(tilt.doubt)
+    upright = seen(30, 0.02)
+    upright.begin()
+    for _ in range(45):
+        upright.see(np.array([0.0, 0.0, 9.8]))
+    assert upright.angle == 0.0 and upright.doubt is None
