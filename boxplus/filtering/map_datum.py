@@ -14,6 +14,8 @@ of theirs would be placed, with f n of covariance f A⁻¹. With d = 0, e has th
 A scan that was brought to its end by the prediction shows where the platform was half way, and half of w it shares with it: of
 velocities that are off, ½w; of a walk of variance Q, W(T) less its mean over the scan, of variance Q/3 and Q/2 with w itself.
 Then (I − G) w gives way to (I − G)w + Gw', of covariance (I − ½G) Q (I − ½G)ᵀ + GQGᵀ/12 for a walk, and for velocities nearly.
+The points themselves lie where the platform was half way: the map takes in e − w', Cov(w') = Q/3 and Cov(e, w') = Q/2 − GQ/6. (Of
+points that fill the time since the last scan evenly; where they fill its end only, as after scans that were dropped, less.)
 
 Points that lie on one surface share what is wrong with it, and say less than as many independent ones would: v and n can be
 counted several times for that.
@@ -137,6 +139,7 @@ class MapDatum:
         self._joint[_FIRST, _POSE, _POSE] = self._filter
         self._p_world_imu = x[P : P + 3].copy()
         self._R_world_imu = x[R : R + 9].reshape(3, 3).copy()
+        self._within, self._across = _NOTHING, np.zeros((2, 12, 6))  # Cov(w'), and of both errors with w'
         self._alone = _NOTHING
         self._local_points = 0.0
         self._new_share = 0.0
@@ -166,7 +169,11 @@ class MapDatum:
         self._R_world_imu = R_world_imu
         gain, noise, alone = (_NOTHING,) * 3 if correction is None else (correction.gain, correction.noise, correction.alone)
         counts, deskewed = (self._shared, self._shared * self._new_share), correction is not None and correction.deskewed
-        _follow(x, cov_prior, cov, gain, noise, alone, counts, deskewed, self._p_world_imu, self._filter, self._joint)
+        self._within, self._across = np.zeros((6, 6)), np.zeros((2, 12, 6))
+        _follow(
+            x, cov_prior, cov, gain, noise, alone, counts, deskewed, self._p_world_imu, self._filter, self._joint, self._within,
+            self._across,
+        )  # fmt: skip
         self._alone = alone if correction is None else correction.alone_by_weights
         if correction is not None:
             self._new_share = 0.0
@@ -175,7 +182,7 @@ class MapDatum:
         """The map has taken in so many points of the scan, so many of them in the place of others."""
         self._local_points += points - replaced
         self._new_share = points / self._local_points if points else 0.0
-        _bring(self._new_share, self._joint)
+        _bring(self._new_share, self._joint, self._within, self._across)
 
     def creep(self, cov: NDArray[np.float64], x: NDArray[np.float64]) -> None:
         """Widen the filter's `cov` (n, n), in place, by how the last scan has moved the local map against the pose at x (36,).
@@ -195,6 +202,7 @@ class MapDatum:
         step[_POSE, _POSE] = 0.0
         step[_MAP, _POSE] = -np.eye(6)
         self._joint[_MARKED] = step @ self._joint[_MARKED] @ step.T
+        self._across[_MARKED] = step @ self._across[_MARKED]
 
     def pose_covariance(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """(6, 6) covariance of the pose at x (36,) against the first pose: [θ about the IMU's axes, p along the world's]."""
@@ -222,10 +230,13 @@ def _follow(
     p_world_imu: NDArray[np.float64],
     before: NDArray[np.float64],
     joint: NDArray[np.float64],
+    within: NDArray[np.float64],
+    across: NDArray[np.float64],
 ) -> None:
     """The joint covariances (2, 12, 12), the filter's (6, 6) `before` and the position (3,), from scan to scan, in place.
 
-    `noise` and `alone` count `counts` times; `gain`, `noise` and `alone` (6, 6) are zero where nothing corrected.
+    `noise` and `alone` count `counts` times; `gain`, `noise` and `alone` (6, 6) are zero where nothing corrected. Zeros `within`
+    (6, 6) and `across` (2, 12, 6) receive what the map does not take in of the pose's error.
     """
     rotation, move, step = x[R : R + 9], np.eye(6), np.eye(12)
     prior, turned, work = np.empty((6, 6)), np.empty((6, 6)), np.empty((12, 12))
@@ -246,6 +257,13 @@ def _follow(
     _congruence(through, added, work, by_imu)
     if deskewed:
         _congruence(turned, added, work, own)
+        for i in range(6):
+            for j in range(6):
+                within[i, j] = added[i, j] / 3.0
+                cross = 0.5 * added[i, j]
+                for k in range(6):
+                    cross -= turned[i, k] * added[k, j] / 6.0
+                across[0, i, j] = across[1, i, j] = cross
     _turn_into(noise, rotation, turned)
     _turn_into(alone, rotation, prior)
     both, moved = np.zeros((12, 12)), np.empty((12, 12))
@@ -267,18 +285,25 @@ def _follow(
 
 
 @kernel
-def _bring(share: float, joint: NDArray[np.float64]) -> None:
-    """The map errs by a share of the pose's error, and by the rest of its own: joint covariances (2, 12, 12), in place."""
+def _bring(share: float, joint: NDArray[np.float64], within: NDArray[np.float64], across: NDArray[np.float64]) -> None:
+    """The map errs by a share of what the pose's error e is less w', and by the rest of its own: joint (2, 12, 12), in place.
+
+    Args:
+        share: of the local map, that is new.
+        within: (6, 6) covariance of w'; across: (2, 12, 6) of both errors with w'.
+    """
     kept = 1.0 - share
     for k in range(joint.shape[0]):
         for i in range(6):
             for j in range(i + 1):
-                across = joint[k, i, 6 + j] + joint[k, j, 6 + i]
-                of_map = kept * kept * joint[k, 6 + i, 6 + j] + kept * share * across + share * share * joint[k, i, j]
+                both = joint[k, i, 6 + j] + joint[k, j, 6 + i] - across[k, 6 + i, j] - across[k, 6 + j, i]
+                brought = joint[k, i, j] + within[i, j] - across[k, i, j] - across[k, j, i]
+                of_map = kept * kept * joint[k, 6 + i, 6 + j] + kept * share * both + share * share * brought
                 joint[k, 6 + i, 6 + j] = joint[k, 6 + j, 6 + i] = of_map
         for i in range(6):
             for j in range(6):
-                joint[k, i, 6 + j] = joint[k, 6 + j, i] = kept * joint[k, i, 6 + j] + share * joint[k, i, j]
+                of_pose = joint[k, i, j] - across[k, i, j]  # of e with e − w'
+                joint[k, i, 6 + j] = joint[k, 6 + j, i] = kept * joint[k, i, 6 + j] + share * of_pose
 
 
 @kernel

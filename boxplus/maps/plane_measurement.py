@@ -127,8 +127,11 @@ class PlaneMeasurement:
         return Information(A.sum(axis=0), b.sum(axis=0), self._pull * self._weight, self._directions, used, rms), A, b
 
     def scatter(self, x: NDArray[np.float64]) -> float:
-        """Of the variance that the information states, what the residuals at x (36,) bear out, 0.05 to 1: `plane_scatter`."""
-        return float(plane_scatter(x, self._p_lidar, self._planes, self._fate, self._about_pose))
+        """Of the variance that the information states, what the residuals at x (36,) bear out, 0.05 to 1: `plane_scatter`.
+
+        All of it where a weight says that points are not where they seem: that is an error they share, and no residual shows.
+        """
+        return 1.0 if self._weight < 1.0 else float(plane_scatter(x, self._p_lidar, self._planes, self._fate, self._about_pose))
 
     def has_moved(self, x: NDArray[np.float64]) -> bool:
         """Whether the points have moved far enough since the last search for some to have other neighbours."""

@@ -289,11 +289,16 @@ def test_what_residuals_do_not_bear_out_is_taken_off_and_a_shared_shift_stays(se
 
 @pytest.mark.parametrize("walks", [True, False])
 def test_points_brought_to_the_end_of_their_scan_by_the_prediction_share_its_error(walks: bool) -> None:
-    """Sampled: a walk within the scan, or a velocity that is off; the points, seen all along it, show the mean of what it did."""
-    random, runs, steps = np.random.default_rng(4), 20000, 40
+    """Sampled: a walk within the scan, or a velocity that is off; the points, seen all along it, show the mean of what it did.
+
+    They are laid into the map where they were seen: what the walk did after them is in the pose, and not in the map.
+    """
+    random, runs, steps, marked_at = np.random.default_rng(4), 20000, 40, 4
     x, cov = _state(np.eye(3), np.zeros(3)), 1e-8 * np.eye(24)
-    datum, e = MapDatum(x, cov), 1e-4 * random.normal(size=(runs, 6))
-    for _ in range(4):
+    datum, e, d, local = MapDatum(x, cov), 1e-4 * random.normal(size=(runs, 6)), np.zeros((runs, 6)), 100.0
+    datum.insert(100)
+    d, new, marked = e.copy(), 1.0, e
+    for scan in range(12):
         A, cov_prior = _information(random), cov + 1e-4 * np.eye(24)
         cov = _updated(cov_prior, A)
         correction = Correction.of(
@@ -301,13 +306,31 @@ def test_points_brought_to_the_end_of_their_scan_by_the_prediction_share_its_err
         )
         datum.follow(x, cov_prior, cov, correction)
         noise = np.sqrt(0.05) * np.linalg.cholesky(np.linalg.inv(A[:6, :6]))
+        d = d + np.sqrt(new) * random.normal(size=(runs, 6)) @ noise.T
         w, seen = np.zeros((2, runs, 6))
         rate = 1e-2 * random.normal(size=(runs, 6))
         for _ in range(steps):
             w = w + (1e-2 / np.sqrt(steps) * random.normal(size=(runs, 6)) if walks else rate / steps)
             seen += w / steps
         G = cov[:6, :6] @ A[:6, :6]
-        e = e + w - (e + seen + random.normal(size=(runs, 6)) @ noise.T) @ G.T
-        expected, sampled = datum.pose_covariance(x), np.cov(e.T)
-        ratios = np.linalg.eigvals(np.linalg.solve(expected, sampled)).real
+        laid = e + seen - (e + seen - d + random.normal(size=(runs, 6)) @ noise.T) @ G.T
+        e = laid + w - seen
+        if scan == marked_at:
+            datum.mark()
+            marked = e
+        local += 100.0
+        new = 100.0 / local
+        datum.insert(100)
+        d = (1.0 - new) * d + new * laid
+        ratios = _ratios(datum.pose_covariance(x), e)
         assert ratios.max() < 1.1 and ratios.min() > (0.9 if walks else 0.65)  # 1/4 of what a velocity does, 1/3 of a walk
+    of_map = _ratios(datum._joint[0, 6:, 6:], d)
+    assert of_map.max() < (1.15 if walks else 1.5) and of_map.min() > 0.8
+    if walks:
+        ratios = _ratios(datum.covariance_since_mark(x), e - marked)
+        assert ratios.min() > 0.85 and ratios.max() < 1.15
+
+
+def _ratios(stated: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Of sampled variances to stated ones, along the directions where they differ most."""
+    return np.linalg.eigvals(np.linalg.solve(stated, np.cov(errors.T))).real

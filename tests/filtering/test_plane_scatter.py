@@ -43,23 +43,26 @@ def _scan(x: NavState, y: np.ndarray, normals: np.ndarray, z: np.ndarray) -> tup
 
 
 @settings(max_examples=30)
-@given(seeds, st.sampled_from([0.2, 0.4, 0.7]))
+@given(seeds, st.sampled_from([0.2, 0.3]))
 def test_it_is_the_worst_direction_of_the_sandwich(seed: int, size: float) -> None:
-    """B of the pieces, one by one, against A: so few that hardly two share a slot."""
+    """B of the pieces, one by one, against A: so few that few share a slot."""
     random = np.random.default_rng(seed)
     x = random_state(random)
-    y, normals = _walls(random, 80)
+    y, normals = _walls(random, 120)
     z = size / np.sqrt(_WEIGHT) * random.normal(size=len(y))
     p_lidar, planes, h = _scan(x, y, normals, z)
     fate = np.where(random.random(len(y)) < 0.1, GATED, USED).astype(np.uint8)
-    pieces: defaultdict[tuple[int, ...], np.ndarray] = defaultdict(lambda: np.zeros(6))
+    pieces: defaultdict[tuple[int, ...], list[int]] = defaultdict(list)
     for n in np.flatnonzero(fate == USED):
         at = x.to_world(p_lidar[n : n + 1])[0]
-        pieces[*np.floor(at).astype(int), int(np.abs(normals[n]).argmax())] += _WEIGHT * z[n] * h[n]
+        pieces[*np.floor(at).astype(int), int(np.abs(normals[n]).argmax())].append(n)
     A = _WEIGHT * h[fate == USED].T @ h[fate == USED]
-    B = np.sum([np.outer(g, g) for g in pieces.values()], axis=0)
+    B = np.zeros((6, 6))
+    for piece in pieces.values():
+        g, trace = _WEIGHT * h[piece].T @ z[piece], np.trace(np.linalg.solve(A, _WEIGHT * h[piece].T @ h[piece]))
+        B += np.outer(g, g) / (1.0 - trace) ** 2
     expected = LEAST + np.linalg.eigvals(np.linalg.solve(A, B)).real.max()
-    assert plane_scatter(x.pack(), p_lidar, planes, fate, A) == pytest.approx(min(expected, 1.0), rel=0.2)
+    assert plane_scatter(x.pack(), p_lidar, planes, fate, A) == pytest.approx(min(expected, 1.0), rel=0.25)
 
 
 @pytest.mark.parametrize("size", [0.1, 0.3, 0.45])
@@ -104,3 +107,23 @@ def test_points_that_leave_a_direction_open_bear_nothing_out() -> None:
     p_lidar, planes, h = _scan(NavState.identity(), y, normals, np.zeros(100))
     found = plane_scatter(NavState.identity().pack(), p_lidar, planes, np.zeros(100, np.uint8), _WEIGHT * h.T @ h)
     assert found == 1.0
+
+
+@pytest.mark.parametrize("end_points", [15, 40])
+@pytest.mark.parametrize("size", [0.1, 0.3])
+def test_a_piece_on_which_a_direction_hangs_says_nothing_of_itself(end_points: int, size: float) -> None:
+    """A corridor of 2.7 m with an end wall of which one piece is seen: its residuals vanish, and may be anything."""
+    random = np.random.default_rng(4)
+    x = NavState.identity()
+    walls = np.column_stack([random.uniform(-15, 15, 800), random.choice([-1.35, 1.35], 800), random.uniform(-1.2, 1.2, 800)])
+    floor = np.column_stack([random.uniform(-15, 15, 400), random.uniform(-1.35, 1.35, 400), np.full(400, -1.2)])
+    end = np.column_stack([np.full(end_points, 15.5), random.uniform(0.05, 0.95, (end_points, 2))])
+    y = np.vstack([walls, floor, end])
+    normals = np.repeat(np.eye(3)[[1, 2, 0]], [800, 400, end_points], axis=0)
+    piece = np.unique(np.hstack([np.floor(y), normals]), axis=0, return_inverse=True)[1].ravel()
+    z = size / np.sqrt(_WEIGHT) * random.normal(size=piece.max() + 1)[piece]
+    p_lidar, planes, h = _scan(x, y, normals, z)
+    A = _WEIGHT * h.T @ h
+    drawn = np.linalg.solve(A, _WEIGHT * h.T @ z)
+    planes[:, 3] += h @ drawn  # at the minimum
+    assert plane_scatter(x.pack(), p_lidar, planes, np.zeros(len(y), np.uint8), A) == 1.0
