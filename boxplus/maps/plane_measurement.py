@@ -116,11 +116,11 @@ class PlaneMeasurement:
             A, _, _, _, sums = self._sums(x, edges, criterion=False)
             self._look_closer(x, A.sum(axis=0), int(sums[0]))
         A, b, pull, noise, sums = self._sums(x, edges, criterion=matches)
+        self._about_pose = A.sum(axis=0)[:6, :6]
         if matches:  # in between the planes stay, and what they can tell
             self._pull = pull
             threshold = threshold_for(self._config.weak_threshold, int(sums[0]))
-            self._directions = pose_directions(A.sum(axis=0)[:6, :6], noise, self.lever_arm, threshold)
-        self._about_pose = A.sum(axis=0)[:6, :6]
+            self._directions = pose_directions(self._about_pose, noise, self.lever_arm, threshold)
         used = int(sums[0])
         rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
         A, b = A * self._weight, b * self._weight
