@@ -12,6 +12,7 @@ from boxplus.manifolds.so3 import exp_into, right_jacobian_into
 # A node of the trajectory inside a scan: time [s], R (9), p, v, a_world, ω.
 NODE = 22
 N_TIME, N_R, N_P, N_V, N_A, N_W = 0, 1, 10, 13, 16, 19
+FOLLOWED = 18  # components of the state that change by themselves: all but the mounting
 
 
 @kernel
@@ -58,31 +59,9 @@ def propagate_step(
         Ra[i, 1] = R0[i, 2] * ax - R0[i, 0] * az
         Ra[i, 2] = R0[i, 0] * ay - R0[i, 1] * ax
 
-    # cov <- F cov Fᵀ. F differs from the identity in its first nine rows only: apply it to the columns of cov, then of covᵀ.
-    head = np.empty(9)
-    for side in range(2):
-        for c in range(TANGENT):
-            for i in range(3):
-                theta, v, p = 0.0, 0.0, 0.0
-                for k in range(3):
-                    d_theta = cov[k, c] if side == 0 else cov[c, k]
-                    d_bw = cov[9 + k, c] if side == 0 else cov[c, 9 + k]
-                    d_ba = cov[12 + k, c] if side == 0 else cov[c, 12 + k]
-                    theta += step[k, i] * d_theta - Jr[i, k] * dt * d_bw
-                    push = -(Ra[i, k] * d_theta + R0[i, k] * d_ba)
-                    v += push * dt
-                    p += 0.5 * push * dt * dt
-                d_p = cov[3 + i, c] if side == 0 else cov[c, 3 + i]
-                d_v = cov[6 + i, c] if side == 0 else cov[c, 6 + i]
-                d_g = cov[15 + i, c] if side == 0 else cov[c, 15 + i]
-                head[i] = theta
-                head[3 + i] = d_p + d_v * dt + p + 0.5 * d_g * dt * dt
-                head[6 + i] = d_v + v + d_g * dt
-            for i in range(9):
-                if side == 0:
-                    cov[i, c] = head[i]
-                else:
-                    cov[c, i] = head[i]
+    # cov <- F cov Fᵀ: to the columns of cov, then of covᵀ.
+    _through_step(step, Jr, R0, Ra, dt, cov)
+    _through_step(step, Jr, R0, Ra, dt, cov.T)
 
     # + F_w Q F_wᵀ with Q = density / dt. R Rᵀ = I keeps the accelerometer's blocks diagonal.
     qw, qa = density[0] * dt, density[1] * dt
@@ -100,6 +79,34 @@ def propagate_step(
             mean = 0.5 * (cov[i, j] + cov[j, i])
             cov[i, j] = mean
             cov[j, i] = mean
+
+
+@kernel
+def _through_step(
+    step: NDArray[np.float64],
+    Jr: NDArray[np.float64],
+    R0: NDArray[np.float64],
+    Ra: NDArray[np.float64],
+    dt: float,
+    M: NDArray[np.float64],
+) -> None:
+    """M <- F M for M (18 or more, n). F differs from the identity in its first nine rows only."""
+    head = np.empty(9)
+    for c in range(M.shape[1]):
+        for i in range(3):
+            theta, v, p = 0.0, 0.0, 0.0
+            for k in range(3):
+                d_theta, d_bw, d_ba = M[k, c], M[9 + k, c], M[12 + k, c]
+                theta += step[k, i] * d_theta - Jr[i, k] * dt * d_bw
+                push = -(Ra[i, k] * d_theta + R0[i, k] * d_ba)
+                v += push * dt
+                p += 0.5 * push * dt * dt
+            d_p, d_v, d_g = M[3 + i, c], M[6 + i, c], M[15 + i, c]
+            head[i] = theta
+            head[3 + i] = d_p + d_v * dt + p + 0.5 * d_g * dt * dt
+            head[6 + i] = d_v + v + d_g * dt
+        for i in range(9):
+            M[i, c] = head[i]
 
 
 @kernel
@@ -171,3 +178,29 @@ def _orthonormalise(x: NDArray[np.float64]) -> None:
                 new[3 * i + j] = x[offset + 3 * i] * M[0, j] + x[offset + 3 * i + 1] * M[1, j] + x[offset + 3 * i + 2] * M[2, j]
         for i in range(9):
             x[offset + i] = new[i]
+
+
+@kernel
+def transition(nodes: NDArray[np.float64], duration: float, gravity: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Φ (18, 18): how errors of pose, velocity, biases and gravity go on from the first of the nodes (n, 22) to `duration` [s].
+
+    Args:
+        nodes: as `propagate_interval` has written them; gravity: (3,) of the state.
+    """
+    Phi, Jr, step = np.eye(FOLLOWED), np.empty((3, 3)), np.empty((3, 3))
+    R0, Ra = np.empty((3, 3)), np.empty((3, 3))
+    for n in range(nodes.shape[0]):
+        node = nodes[n]
+        dt = (nodes[n + 1, N_TIME] if n + 1 < nodes.shape[0] else duration) - node[N_TIME]
+        exp_into(node[N_W] * dt, node[N_W + 1] * dt, node[N_W + 2] * dt, step)
+        right_jacobian_into(node[N_W] * dt, node[N_W + 1] * dt, node[N_W + 2] * dt, Jr)
+        fx, fy, fz = node[N_A] - gravity[0], node[N_A + 1] - gravity[1], node[N_A + 2] - gravity[2]
+        for j in range(3):
+            for i in range(3):
+                R0[i, j] = node[N_R + 3 * i + j]
+            # R [a]ₓ = [R a]ₓ R, and R a is what the accelerometer feels along the world's axes
+            Ra[0, j] = fy * node[N_R + 6 + j] - fz * node[N_R + 3 + j]
+            Ra[1, j] = fz * node[N_R + j] - fx * node[N_R + 6 + j]
+            Ra[2, j] = fx * node[N_R + 3 + j] - fy * node[N_R + j]
+        _through_step(step, Jr, R0, Ra, dt, Phi)
+    return Phi

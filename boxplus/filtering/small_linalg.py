@@ -103,3 +103,25 @@ def symmetric_eigen_into(A: NDArray[np.float64], values: NDArray[np.float64], ve
             values[i], values[least] = values[least], values[i]
             for k in range(n):
                 vectors[k, i], vectors[k, least] = vectors[k, least], vectors[k, i]
+
+
+@kernel
+def positive_part_into(M: NDArray[np.float64]) -> None:
+    """The positive semidefinite part of a symmetric matrix takes its place."""
+    n = M.shape[0]
+    values, vectors = np.empty(n), np.empty((n, n))
+    symmetric_eigen_into(M, values, vectors)
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(n):
+                total += vectors[i, k] * max(values[k], 0.0) * vectors[j, k]
+            M[i, j] = total
+            M[j, i] = total
+
+
+def positive_part(M: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The positive semidefinite part of a symmetric matrix."""
+    positive: NDArray[np.float64] = np.array(M, dtype=np.float64)
+    positive_part_into(positive)
+    return positive

@@ -21,9 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
+from boxplus.filtering.nav_state import PL, RL, R
+from boxplus.filtering.plane_information import USED
+from boxplus.filtering.triples import cross, placed, rotation_of, triple_of, turned_back
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_matching import WEIGHT
 
 _SOON_NS = 1_000_000_000
+_ASKED = 1000  # points of a scan, of what they rest on
 _INDEX_BITS = np.uint64(20)
 _INDEX = np.int64(0xFFFFF)
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)  # an odd factor whose product's upper bits depend on all bits of a key
@@ -36,10 +41,14 @@ _TAKEN_BITS, _UPPER, _NO_CELL = 16, np.uint64(48), np.uint64(0xFFFFFFFFFFFFFFFF)
 def _cells_of(points: NDArray[np.float64], size: float, level: np.uint64, cells: NDArray[np.uint64]) -> None:
     """`cells` (n,) of points (n, 3): which cell of this side [m], modulo 2²⁰ on each axis, with the level of the side."""
     for n in range(len(points)):
-        key = level
-        for axis in range(3):
-            key = (key << _INDEX_BITS) | np.uint64(np.int64(math.floor(points[n, axis] / size)) & _INDEX)
-        cells[n] = key
+        cells[n] = _cell_of(points[n, 0], points[n, 1], points[n, 2], size, level)
+
+
+@kernel(inline=True)
+def _cell_of(x: float, y: float, z: float, size: float, level: np.uint64) -> np.uint64:
+    key = (level << _INDEX_BITS) | np.uint64(np.int64(math.floor(x / size)) & _INDEX)
+    key = (key << _INDEX_BITS) | np.uint64(np.int64(math.floor(y / size)) & _INDEX)
+    return (key << _INDEX_BITS) | np.uint64(np.int64(math.floor(z / size)) & _INDEX)
 
 
 @kernel
@@ -88,8 +97,56 @@ def _take(cells: NDArray[np.uint64], table: NDArray[np.uint64]) -> None:
         table[_place_of(cells[n])] = cells[n]
 
 
+@kernel
+def _information_on(
+    cells: NDArray[np.uint64],
+    side: float,
+    level: np.uint64,
+    origin: NDArray[np.float64],
+    x: NDArray[np.float64],
+    p_lidar: NDArray[np.float32],
+    planes: NDArray[np.float64],
+    fate: NDArray[np.uint8],
+    neighbours: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    """(6, 6): of the information about the pose that planes carry, what rests on points in `cells` (k,); every n-th is asked."""
+    shift = np.uint64(62)  # of a table that is a quarter full at most
+    while 4 * len(cells) > 1 << np.int64(np.uint64(64) - shift):
+        shift -= _ONE
+    table = np.full(1 << np.int64(np.uint64(64) - shift), _NO_CELL)
+    mask = np.uint64(table.shape[0]) - _ONE
+    for k in range(len(cells)):
+        slot = (cells[k] * _SPREAD) >> shift
+        while table[slot] != _NO_CELL:
+            slot = (slot + _ONE) & mask
+        table[slot] = cells[k]
+    rotation, mounting, lever = rotation_of(x, R), rotation_of(x, RL), triple_of(x, PL)
+    A, h, corners = np.zeros((6, 6)), np.empty(6), neighbours.shape[1]
+    stride = max(p_lidar.shape[0] // _ASKED, 1)
+    for n in range(0, p_lidar.shape[0], stride):
+        if fate[n] != USED:
+            continue
+        count = 0
+        for i in range(corners):
+            q = triple_of(neighbours[n, i], 0)
+            cell = _cell_of(q[0] + origin[0], q[1] + origin[1], q[2] + origin[2], side, level)
+            slot = (cell * _SPREAD) >> shift
+            while table[slot] != _NO_CELL and table[slot] != cell:
+                slot = (slot + _ONE) & mask
+            count += table[slot] == cell
+        if count == 0:
+            continue
+        s, u = placed(mounting, lever, triple_of(p_lidar[n], 0)), triple_of(planes[n], 0)
+        turn, weight = cross(s, turned_back(rotation, u)), planes[n, WEIGHT] * stride * count / corners
+        h[0], h[1], h[2], h[3], h[4], h[5] = turn[0], turn[1], turn[2], u[0], u[1], u[2]
+        for i in range(6):
+            for j in range(6):
+                A[i, j] += weight * h[i] * h[j]
+    return A
+
+
 class FirstArrivals:
-    """What was the first in its cell of a downsampled map, for a second.
+    """What was the first in its cell of a downsampled map, for a second, and where the last scan has left points.
 
     Args:
         largest_cell: side of the map's cells, which may be halved from scan to scan [m].
@@ -101,6 +158,7 @@ class FirstArrivals:
         self._points = np.empty((0, 3))
         self._time_ns = np.empty(0, np.int64)
         self._taken, self._taken_side = np.full(1 << _TAKEN_BITS, _NO_CELL), largest_cell
+        self._newest, self._newest_side = np.empty(0, np.uint64), largest_cell
 
     def forget_map(self) -> None:
         """The map has lost points otherwise than here: nothing is known of its cells."""
@@ -127,15 +185,38 @@ class FirstArrivals:
         asked = np.flatnonzero(~taken | waited)
         stored = asked[tree.insert(p_world[asked], downsample=True).stored]
         _take(cells[asked], self._taken)
+        self._newest, self._newest_side = cells[stored], side
         first = stored[~waited[stored]]
         self._cells = np.concatenate([self._cells, cells[first]])
         self._points = np.concatenate([self._points, p_world[first]])
         self._time_ns = np.concatenate([self._time_ns, np.full(len(first), time_ns)])
         return len(stored), int(np.count_nonzero(again))
 
+    def information_on_newest(
+        self,
+        x: NDArray[np.float64],
+        origin: NDArray[np.float64],
+        p_lidar: NDArray[np.float32],
+        planes: NDArray[np.float64],
+        fate: NDArray[np.uint8],
+        neighbours: NDArray[np.float32],
+    ) -> NDArray[np.float64]:
+        """(6, 6): of the information about the pose at x (36,) that a scan has, what rests on points of the scan before.
+
+        Args:
+            origin: (3,) of the map.
+            p_lidar, planes, fate, neighbours: of all points, as `PlaneMeasurement` has them.
+        """
+        side, level = self._newest_side, self._level_of(self._newest_side)
+        on_newest: NDArray[np.float64] = _information_on(self._newest, side, level, origin, x, p_lidar, planes, fate, neighbours)
+        return on_newest
+
+    def _level_of(self, cell: float) -> np.uint64:
+        return np.uint64(max(round(math.log2(self._largest_cell / cell)), 0))
+
     def _in_cells(self, p_world: NDArray[np.float64], cell: float) -> NDArray[np.uint64]:
         cells = np.empty(len(p_world), np.uint64)
-        _cells_of(np.ascontiguousarray(p_world), cell, np.uint64(max(round(math.log2(self._largest_cell / cell)), 0)), cells)
+        _cells_of(np.ascontiguousarray(p_world), cell, self._level_of(cell), cells)
         return cells
 
     def _seen_again(self, cells: NDArray[np.uint64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

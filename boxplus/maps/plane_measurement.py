@@ -28,6 +28,7 @@ from boxplus.filtering.plane_information import (
 from boxplus.filtering.plane_scatter import plane_scatter
 from boxplus.filtering.small_linalg import cholesky_inverse_into
 from boxplus.maps.curved_patches import FILLED_CELLS, MEAN_LEVERAGE, ONE_WAY, PATCH, SPARSE_CELLS, bend_planes
+from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.ikd_tree.search import STACK, STACK_DEPTH
 from boxplus.maps.plane_confirmation import CONFIRMING, DENSE_CELLS, LEVERAGE, confirm_planes
@@ -35,6 +36,7 @@ from boxplus.maps.plane_matching import MANY, NEIGHBOURS, PLANE, match_planes, s
 from boxplus.maps.registration_config import RegistrationConfig
 
 _CHUNK = 1024
+_UNTOLD = 1e-3  # of the mean information: directions that have less are hardly told
 _SAME_NEIGHBOURS = 0.05  # cells of the map a point may move and keep its neighbours
 REASONS = {
     FEW_NEIGHBOURS: "fewer than five map points near",
@@ -132,6 +134,22 @@ class PlaneMeasurement:
         All of it where a weight says that points are not where they seem: that is an error they share, and no residual shows.
         """
         return 1.0 if self._weight < 1.0 else float(plane_scatter(x, self._p_lidar, self._planes, self._fate, self._about_pose))
+
+    def renewal(self, x: NDArray[np.float64], arrivals: FirstArrivals, share: float) -> NDArray[np.float64]:
+        """F (6, 6): of a shift of the map against the pose at x (36,), what this scan sees if only the last one's points shift.
+
+        With the information A of all planes and A' of what rests on these points, F = A⁻¹A'. Rings that wander over a floor stand
+        on what the scan before has left there; along other directions, where all is known, a hundredth of the points is new.
+
+        Args:
+            arrivals: of the map.
+            share: of the map that is new, for directions of which nothing tells.
+        """
+        A = self._about_pose
+        newest = arrivals.information_on_newest(x, self._tree.origin, self._p_lidar, self._planes, self._fate, self._neighbours)
+        scale = np.repeat([self.lever_arm**2, 1.0], 3)
+        little = np.diag(_UNTOLD * max(float(np.mean(A.diagonal() / scale)), 1e-12) * scale)
+        return np.asarray(np.linalg.solve(A + little, newest + share * little), dtype=np.float64)
 
     def has_moved(self, x: NDArray[np.float64]) -> bool:
         """Whether the points have moved far enough since the last search for some to have other neighbours."""

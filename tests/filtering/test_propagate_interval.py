@@ -9,7 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boxplus.filtering.nav_state import TANGENT, NavState
-from boxplus.filtering.propagation import N_P, N_R, N_TIME, N_V, N_W, NODE, propagate_interval, propagate_step
+from boxplus.filtering.propagation import (
+    FOLLOWED,
+    N_P,
+    N_R,
+    N_TIME,
+    N_V,
+    N_W,
+    NODE,
+    propagate_interval,
+    propagate_step,
+    transition,
+)
 from boxplus.manifolds import so3
 from tests.filtering.random_states import random_covariance, random_state
 
@@ -141,3 +152,18 @@ def test_an_interval_without_length_has_a_node_and_changes_nothing() -> None:
     assert len(nodes) == 1
     assert np.allclose(state.pack(), x.pack(), atol=1e-14)
     assert np.allclose(covariance, cov, rtol=1e-12)
+
+
+@settings(max_examples=50)
+@given(seeds, st.integers(2, 12), st.floats(0.01, 0.12))
+def test_the_transition_carries_a_covariance_as_the_pass_does(seed: int, samples: int, duration: float) -> None:
+    """Across a gap too; what the noise adds is the difference to a pass without errors at its beginning."""
+    random = np.random.default_rng(seed)
+    time = np.cumsum(random.uniform(0.002, 0.03, samples))
+    gyro, accel = random.normal(size=(samples, 3)), 10.0 * random.normal(size=(samples, 3))
+    x, cov = random_state(random), random_covariance(random)
+    state, carried, nodes = _forward(x, cov, time, gyro, accel, duration, max_gap=0.02)
+    _, noise, _ = _forward(x, np.zeros((TANGENT, TANGENT)), time, gyro, accel, duration, max_gap=0.02)
+    Phi = np.eye(TANGENT)
+    Phi[:FOLLOWED, :FOLLOWED] = transition(nodes, duration, state.gravity_world)
+    np.testing.assert_allclose(Phi @ cov @ Phi.T + noise, carried, rtol=1e-9, atol=1e-9)

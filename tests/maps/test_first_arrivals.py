@@ -6,8 +6,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from boxplus.filtering.nav_state import NavState
+from boxplus.filtering.plane_information import USED
+from boxplus.manifolds import so3
 from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
+from boxplus.maps.plane_matching import PLANE, WEIGHT
 
 CELL = 0.25
 SOON_NS = 1_000_000_000
@@ -76,3 +80,36 @@ def test_a_surface_that_comes_into_view_is_not_where_noise_first_reached_it() ->
 
     assert below_ceiling(plain) > 0.005
     assert abs(below_ceiling(tree)) < 0.5 * below_ceiling(plain)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(20, 2500))
+def test_information_that_rests_on_the_points_of_the_last_scan(seed: int, count: int) -> None:
+    """Against sums over all planes in words, of neighbours in a map away from its origin."""
+    random = np.random.default_rng(seed)
+    tree, arrivals = IkdTree(cell_size=CELL), FirstArrivals(CELL)
+    old, new = random.uniform(-2.0, 2.0, (2, 300, 3)) + np.array([30.0, -7.0, 2.0])
+    arrivals.insert_into(tree, old, 0)
+    before = tree.points()
+    arrivals.insert_into(tree, new, 2 * SOON_NS)
+    stored = tree.points()
+    is_new = ~(np.abs(stored[:, None] - before[None]).max(axis=2) < 1e-6).any(axis=1)
+    chosen = random.integers(0, len(stored), (count, 5))
+    neighbours = (stored[chosen] - tree.origin).astype(np.float32)
+    zero = np.zeros(3)
+    x = NavState(
+        so3.exp(random.normal(size=3)), zero, zero, zero, zero, zero, so3.exp(random.normal(size=3)), random.normal(size=3)
+    )
+    p_lidar, planes = random.normal(size=(count, 3)).astype(np.float32), np.zeros((count, PLANE))
+    u = random.normal(size=(count, 3))
+    planes[:, :3], planes[:, WEIGHT] = u / np.linalg.norm(u, axis=1)[:, None], random.uniform(1.0, 2.0, count)
+    fate = random.integers(0, 3, count).astype(np.uint8)
+    stride = max(count // 1000, 1)
+    expected = np.zeros((6, 6))
+    for n in range(0, count, stride):
+        s = x.R_imu_lidar @ p_lidar[n] + x.p_imu_lidar
+        h = np.concatenate([np.cross(s, x.R_world_imu.T @ planes[n, :3]), planes[n, :3]])
+        share = is_new[chosen[n]].mean() if fate[n] == USED else 0.0
+        expected += stride * share * planes[n, WEIGHT] * np.outer(h, h)
+    found = arrivals.information_on_newest(x.pack(), tree.origin, p_lidar, planes, fate, neighbours)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from boxplus.filtering.nav_state import NavState
 from boxplus.manifolds import so3
+from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig
@@ -163,3 +164,22 @@ def test_where_a_scan_faces(seed: int, half_angle: float) -> None:
     points = (distance[:, None] * rays).astype(np.float32)
     facing = _measure(points, IkdTree()).facing
     np.testing.assert_allclose(facing, [0.5 * (1.0 + np.cos(half_angle)), 0.0, 0.0], atol=0.02)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_what_a_scan_sees_of_the_map_is_new_where_its_planes_rest_on_the_last_scan(share: float) -> None:
+    """A corridor whose floor the last scan has brought, and whose walls stand long since; along it nothing tells."""
+    random = np.random.default_rng(7)
+    faces = _faces(random, 30_000, open_x=True)
+    floor = faces[:, 2] < -1.99
+    tree, arrivals = IkdTree(cell_size=0.25), FirstArrivals(0.25)
+    arrivals.insert_into(tree, faces[~floor & (faces[:, 2] < 1.99)], 0)
+    arrivals.insert_into(tree, faces[floor], 2_000_000_000)
+    x = NavState.identity()
+    world = _faces(random, 3000, open_x=True)
+    measurement = _measure(_look(world, x), tree)
+    measurement.at(x.pack(), rematch=True)
+    F = measurement.renewal(x.pack(), arrivals, share)
+    assert F[5, 5] > 0.9 and F[0, 0] < 0.9  # height; roll is held by the walls too
+    assert abs(F[4, 4]) < 0.1 and abs(F[2, 2]) < 0.2
+    assert F[3, 3] == pytest.approx(share, abs=0.1)

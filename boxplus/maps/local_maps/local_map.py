@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from boxplus._numbers import as_floats
 from boxplus.errors import InputError
-from boxplus.filtering.map_datum import positive_part
+from boxplus.filtering.small_linalg import positive_part
 from boxplus.manifolds import se3
 from boxplus.manifolds.se3 import SE3
 

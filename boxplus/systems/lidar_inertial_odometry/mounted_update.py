@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from boxplus.filtering.correction import Correction
 from boxplus.filtering.iterated_update import Measurement, Posterior, iterated_update
-from boxplus.filtering.map_datum import SHARED_ERRORS, Correction
+from boxplus.filtering.map_datum import SHARED_ERRORS
 from boxplus.filtering.nav_state import RL
 from boxplus.filtering.uncertain_instant import UncertainInstant
+from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import (
@@ -41,13 +43,20 @@ class MountedUpdate:
     B_prior: NDArray[np.float64]
     B: NDArray[np.float64]
 
-    def correction(self, measurement: PlaneMeasurement, stamped: UncertainInstant) -> Correction:
-        """What the scan has done to the pose, its points as far off as their residuals bear out, its stamp as far as is set."""
+    def correction(
+        self, measurement: PlaneMeasurement, stamped: UncertainInstant, arrivals: FirstArrivals, share: float
+    ) -> Correction:
+        """What the scan has done to the pose, its points as far off as their residuals bear out, its stamp as far as is set.
+
+        Args:
+            measurement, stamped: the scan against the map.
+            arrivals: of the map; share: of it, what the last scan has brought.
+        """
         posterior, x = self.posterior, self.posterior.x
         facing, scatter = x[RL : RL + 9].reshape(3, 3) @ measurement.facing, measurement.scatter(x)
-        directions = posterior.last.directions
+        directions, renewed = posterior.last.directions, measurement.renewal(x, arrivals, share)
         return Correction.of(
-            self.cov, posterior.A, directions, facing, scatter=scatter, shared_shift=stamped.shift, deskewed=True
+            self.cov, posterior.A, directions, facing, scatter=scatter, shared_shift=stamped.shift, deskewed=True, renewed=renewed
         )
 
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from boxplus._arguments import as_settings
 from boxplus._stopwatch import Stopwatch
 from boxplus.filtering.map_datum import SHARED_ERRORS, MapDatum
-from boxplus.filtering.nav_state import TANGENT, NavState, P, V
-from boxplus.filtering.propagation import NODE, propagate_interval
+from boxplus.filtering.nav_state import TANGENT, G, NavState, P, V
+from boxplus.filtering.propagation import FOLLOWED, NODE, propagate_interval, transition
 from boxplus.filtering.uncertain_instant import UncertainInstant
 from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
@@ -97,7 +97,7 @@ class LidarInertialOdometry(Snapshots):
         self._one_way = False  # whether the LiDAR sees one way
         self._x: NDArray[np.float64] = np.zeros(0)
         self._cov: NDArray[np.float64] = np.zeros((TANGENT, TANGENT))
-        self._datum = MapDatum(NavState.identity().pack(), self._cov, SHARED_ERRORS)
+        self._datum = MapDatum(NavState.identity().pack(), self._cov, SHARED_ERRORS, FOLLOWED)
         self._mounting, self._noise = UnknownMounting(NavState.identity().pack(), self.config), ObservedNoise(self.config)
         self._mounting_drift: MountingDrift | None = None
         self._gap: str | None = None
@@ -222,7 +222,7 @@ class LidarInertialOdometry(Snapshots):
         self._x, self._cov, self._time_ns = found.state.pack(), found.covariance.copy(), found.time_ns
         self._motion = np.stack([np.zeros(3), found.state.v_world_imu])
         known = self._cov if self.config.extrinsic_estimation == "off" else mounting_known(self._cov)[0]
-        self._datum = MapDatum(self._x, known if self._gap is None else with_unknown_pose(known), SHARED_ERRORS)
+        self._datum = MapDatum(self._x, known if self._gap is None else with_unknown_pose(known), SHARED_ERRORS, FOLLOWED)
         self._mounting = UnknownMounting(self._x, self.config)
         self._mounting_drift = None if self.config.extrinsic_estimation == "off" else MountingDrift(self._x)
         self._unshown = UnshownMotion(found.unshown_axes, found.time_ns, found.state.p_world_imu, found.doubted)
@@ -246,9 +246,10 @@ class LidarInertialOdometry(Snapshots):
         clock = Stopwatch()
         if begins_blind(frame, self.config.max_imu_gap):
             frame = self._see_motion(frame)
-        p_lidar = self._propagate(frame)
+        p_lidar, passed = self._propagate(frame)
         if self._standstill is not None and self._standstill.active:
-            self._standstill.update(frame.imu, frame.duration_s, self._x, self._cov)
+            left = self._standstill.update(frame.imu, frame.duration_s, self._x, self._cov)
+            passed = None if passed is None else left[:FOLLOWED, :FOLLOWED] @ passed
         clock.lap("propagate and deskew")
         self._slide_map()
         clock.lap("slide map")
@@ -266,8 +267,8 @@ class LidarInertialOdometry(Snapshots):
         taken = posterior.valid and not self._is_astray(frame, on_map)
         if taken:
             self._x, self._cov = posterior.x, posterior.cov
-        correction = update.correction(measurement, stamped) if taken else None
-        self._datum.follow(self._x, cov_prior, update.cov if taken else cov_prior, correction)
+        correction = update.correction(measurement, stamped, self._arrivals, self._datum.new_share) if taken else None
+        self._datum.follow(self._x, cov_prior, update.cov if taken else cov_prior, correction, passed)
         if self._mounting_drift is not None:
             after = self._x, update.B if taken else update.B_prior
             self._mounting_drift.follow((x_prior, update.B_prior), after, self._cov[MOUNTING, MOUNTING], correction)
@@ -305,8 +306,8 @@ class LidarInertialOdometry(Snapshots):
             self._x[V : V + 3] = motion[1]
         return frame
 
-    def _propagate(self, frame: Frame) -> NDArray[np.float32]:
-        """Forward through the IMU samples to the end of the scan; every point is moved to that instant."""
+    def _propagate(self, frame: Frame) -> tuple[NDArray[np.float32], NDArray[np.float64] | None]:
+        """Forward to the end of the scan; every point is moved to that instant. With how errors go on, where the IMU tells."""
         self._x_before = self._x.copy()
         saturated = dict.fromkeys(limit.text for limit in self._saturation.update(frame.imu))
         self._warnings += [f"{text}: motion beyond it is not measured, covariance widened" for text in saturated]
@@ -314,9 +315,9 @@ class LidarInertialOdometry(Snapshots):
         if saturated:
             density = np.maximum(density, _SATURATED_DENSITY)
         p_lidar, nodes = self._deskew(frame, density)
-        self._time_ns = frame.scan.end_ns
+        seconds, self._time_ns = (frame.scan.end_ns - self._time_ns) * 1e-9, frame.scan.end_ns
         self._excitation.add(nodes)
-        return p_lidar
+        return p_lidar, None if self._is_blind(frame) else transition(nodes, seconds, self._x[G : G + 3])
 
     def _deskew(self, frame: Frame, density: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
         """State and covariance move to the end of the scan; returns its points as seen from there, and the nodes."""

@@ -41,8 +41,10 @@ class Standstill:
         self._memory_s = seconds
         self._recent: list[tuple[float, NDArray[np.float64]]] = []
 
-    def update(self, imu: ImuSamples, seconds: float, x: NDArray[np.float64], cov: NDArray[np.float64]) -> None:
+    def update(self, imu: ImuSamples, seconds: float, x: NDArray[np.float64], cov: NDArray[np.float64]) -> NDArray[np.float64]:
         """If the platform still rests, apply v = 0 to the state x (36,) and its covariance (24, 24), in place.
+
+        Returns what that leaves of the errors of the state, (24, 24).
 
         Args:
             imu: the samples of a scan; seconds: how long it took [s].
@@ -51,7 +53,7 @@ class Standstill:
         displacement = np.linalg.norm(x[P : P + 3] - self._p_world_imu)
         if self._sets_off(imu, seconds) or displacement > _MAX_DISPLACEMENT:
             self.active = False
-            return
+            return np.eye(TANGENT)
         columns = cov[:, T_V : T_V + 3]
         innovation = cov[T_V : T_V + 3, T_V : T_V + 3] + _ZERO_VELOCITY_SIGMA**2 * np.eye(3)
         gain = np.linalg.solve(innovation, columns.T).T
@@ -63,6 +65,7 @@ class Standstill:
         reduce[:, T_V : T_V + 3] -= gain
         reduced = reduce @ cov @ reduce.T + _ZERO_VELOCITY_SIGMA**2 * gain @ gain.T
         cov[:] = 0.5 * (reduced + reduced.T)
+        return reduce
 
     def _sets_off(self, imu: ImuSamples, seconds: float) -> bool:
         """Whether the turns and changes of velocity of the last scans are more than noise, over any of the lengths."""

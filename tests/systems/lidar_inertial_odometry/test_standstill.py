@@ -84,3 +84,16 @@ def test_while_it_rests_the_velocity_is_zero_and_known() -> None:
     np.testing.assert_allclose(x[P : P + 3], [0.02 - 0.05, 0.1, 0.0], atol=1e-4)  # what goes with the velocity
     assert np.all(np.sqrt(np.diag(cov)[T_V : T_V + 3]) < 0.0101)
     assert np.all(np.linalg.eigvalsh(cov) > 0.0) and np.array_equal(cov, cov.T)
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_it_says_what_it_has_left_of_the_errors(rests: bool) -> None:
+    """P⁺ = (I − KH) P⁻, and nothing of it where the platform moves."""
+    rng = np.random.default_rng(2)
+    still = Standstill(_samples(0.0, 1.0, 2e-3, rng), np.zeros(3))
+    root, x = rng.normal(size=(TANGENT, TANGENT)), NavState.identity().pack()
+    cov = 1e-4 * root @ root.T
+    before = cov.copy()
+    left = still.update(_samples(1.0, 0.1, 2e-3, rng, 0.0 if rests else 5.0), 0.1, x, cov)
+    np.testing.assert_allclose(left @ before, cov, atol=1e-9)
+    assert (left == np.eye(TANGENT)).all() == (not rests)

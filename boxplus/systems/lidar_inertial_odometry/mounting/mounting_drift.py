@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.map_datum import Correction
+from boxplus.filtering.correction import Correction
 from boxplus.filtering.nav_state import P, R
 from boxplus.manifolds import so3
 from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import first_sensitivity
@@ -54,7 +54,7 @@ class MountingDrift:
         x = posterior[0]
         move = np.eye(6)
         move[3:, :3] = -so3.hat(x[P : P + 3] - self._p_world_imu)
-        gain = np.zeros((6, 6)) if correction is None else _along_world(x) @ correction.gain @ _along_world(x).T
+        gain = np.zeros((6, 6)) if correction is None else _along_world(x) @ correction.gain[_POSE] @ _along_world(x).T
         self._map = move @ self._map
         predicted = move @ self._pose + _placement(*prior) - move @ self._filter
         self._pose = predicted + gain @ (self._map - predicted)

@@ -23,7 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.map_datum import MapDatum, positive_part
+from boxplus.filtering.map_datum import MapDatum
+from boxplus.filtering.small_linalg import positive_part
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.registration_config import RegistrationConfig
 from boxplus.systems.lidar_inertial_agreement.lidar_path.older_scans import deviations_of, register_to

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from boxplus.filtering.map_datum import Correction, MapDatum
+from boxplus.filtering.correction import Correction
+from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState
 from boxplus.manifolds import so3
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
