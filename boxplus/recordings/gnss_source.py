@@ -33,7 +33,10 @@ def read_fixes(path: str | Path, topic: str = ANY_GNSS) -> GnssFixes:
     for folder in (path / "oxts", path):
         if folder.is_dir() and (folder / "timestamps.txt").is_file() and (folder / "data").is_dir():
             files = sensor_files(folder, ".txt")
-            return oxts_fixes(files.paths, files.time_ns)
+            fixes = oxts_fixes(files.paths, files.time_ns)
+            if files.untimed:
+                fixes.rejected["data file without a time"] = files.untimed
+            return fixes
     container = open_container(path)
     try:
         found = [channel for channel in container.channels if channel.type == NAV_SAT_FIX and channel.count]

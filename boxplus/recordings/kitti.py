@@ -31,13 +31,26 @@ _CALIBRATION = "calib_imu_to_velo.txt"
 
 @dataclass(frozen=True, slots=True)
 class SensorFiles:
-    """File names and times of one sensor; a line of the time file without its data file is left out and counted."""
+    """File names and times of one sensor; a time without its data file, and a file without its time, are left out and counted."""
 
     paths: list[Path]
     time_ns: NDArray[np.int64]
     start_ns: NDArray[np.int64]
     end_ns: NDArray[np.int64]
     missing: int
+    untimed: int
+
+    def incomplete(self, name: str, what: str) -> list[Evidence]:
+        """What is left out of the sensor of a name, whose files are each a `what`."""
+        texts, found = list[str](), len(self.paths)
+        if self.missing:
+            texts.append(f"{self.missing} of the {self.missing + found} times in {name} have no {what}: these are gaps")
+        if self.untimed:
+            texts.append(
+                f"{self.untimed} of the {self.untimed + found} {what}s in {name} have no time and are left out: a time file was "
+                "cut; unpack the whole drive"
+            )
+        return [Evidence("file", "incomplete", "warning", text) for text in texts]
 
 
 def open_kitti(path: Path, options: RecordingOptions) -> Recording:
@@ -54,9 +67,8 @@ def open_kitti(path: Path, options: RecordingOptions) -> Recording:
     T_imu_lidar, source = (None, "") if imu is None else _calibration(path)
     evidence = [_point_time_evidence(scans, options, path / "velodyne_points")]
     for name, files in (("velodyne_points", scans), ("oxts", imu)):
-        if files is not None and files.missing:
-            text = f"{files.missing} of the {files.missing + len(files.paths)} times in {name} have no data file: these are gaps"
-            evidence.append(Evidence("file", "incomplete", "warning", text))
+        if files is not None:
+            evidence += files.incomplete(name, "data file")
     if imu is None:
         evidence.append(no_imu(options.imu_topic == NO_IMU))
     else:
@@ -145,7 +157,10 @@ def sensor_files(folder: Path, suffix: str, time_file: str = "timestamps.txt") -
         raise RecordingError(f"data files like 0000000000{suffix}", f"none in {folder / 'data'}", "unpack the whole drive")
     kept = [path for path, there in zip(paths, present, strict=True) if there]
     time_ns = time_ns[present]
-    return SensorFiles(kept, time_ns, time_ns, time_ns, int((~present).sum()))
+    # A copy that was cut ends its time file early, and what it then says nothing of would be a shorter drive.
+    numbers = (path.stem for path in (folder / "data").glob(f"*{suffix}"))
+    untimed = sum(1 for number in numbers if number.isdecimal() and int(number) >= len(paths))
+    return SensorFiles(kept, time_ns, time_ns, time_ns, int((~present).sum()), untimed)
 
 
 def _scan_files(folder: Path, options: RecordingOptions) -> SensorFiles:
@@ -161,7 +176,7 @@ def _scan_files(folder: Path, options: RecordingOptions) -> SensorFiles:
             f"{len(starts.time_ns)} and {len(ends.time_ns)} in {folder}",
             "unpack the drive again",
         )
-    return SensorFiles(starts.paths, starts.time_ns, starts.time_ns, ends.time_ns, starts.missing)
+    return SensorFiles(starts.paths, starts.time_ns, starts.time_ns, ends.time_ns, starts.missing, starts.untimed)
 
 
 def _has_turn_times(folder: Path) -> bool:
@@ -185,7 +200,7 @@ def _turns_around(forward: SensorFiles, folder: Path) -> SensorFiles:
     ends = round(float(turn)) // 2
     start_ns = forward.time_ns - np.concatenate(([ends], half))
     end_ns = forward.time_ns + np.concatenate((half, [ends]))
-    return SensorFiles(forward.paths, forward.time_ns, start_ns, end_ns, forward.missing)
+    return SensorFiles(forward.paths, forward.time_ns, start_ns, end_ns, forward.missing, forward.untimed)
 
 
 def _point_time_evidence(scans: SensorFiles, options: RecordingOptions, folder: Path) -> Evidence:

@@ -8,6 +8,7 @@ import pytest
 
 from boxplus.errors import RecordingError
 from boxplus.recordings import RecordingOptions, open_recording
+from boxplus.recordings.gnss_source import read_fixes
 from boxplus.recordings.kitti import read_times
 from boxplus.sensors.inertial.imu import ImuSamples
 from boxplus.sensors.lidar.scan import Scan
@@ -89,6 +90,18 @@ def test_broken_and_missing_files_are_counted(drive: Path) -> None:
         }
         assert any("1 of the 50 times in oxts have no data file" in e.text for e in recording.info.evidence)
     assert sum(isinstance(e, Scan) for e in events) == 4
+
+
+def test_data_files_without_a_time_are_counted(drive: Path) -> None:
+    """Of a copy that was cut; it passed for a shorter drive."""
+    for name in ("timestamps.txt", "timestamps_start.txt", "timestamps_end.txt"):
+        file = drive / "velodyne_points" / name
+        file.write_text("".join(file.read_text().splitlines(keepends=True)[:3]))
+    (drive / "oxts" / "timestamps.txt").write_text(stamps(0.0, 0.01, 40))
+    texts = [e.text for e in open_recording(drive).info.evidence if e.verdict == "warning"]
+    assert any("2 of the 5 data files in velodyne_points have no time" in text for text in texts)
+    assert any("10 of the 50 data files in oxts have no time" in text for text in texts)
+    assert read_fixes(drive).rejected["data file without a time"] == 10
 
 
 def test_without_the_ends_of_the_turns_they_are_reconstructed(drive: Path) -> None:

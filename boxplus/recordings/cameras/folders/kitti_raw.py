@@ -14,6 +14,7 @@ The body is the IMU; without oxts it is the first camera.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,11 +60,7 @@ def open_kitti_raw(path: Path, options: CameraRecordingOptions) -> CameraRecordi
     images: list[ImageFiles] = []
     for folder in _folders(path):
         files = sensor_files(folder, ".png")
-        if files.missing:
-            text = (
-                f"{files.missing} of the {files.missing + len(files.paths)} times in {folder.name} have no image: these are gaps"
-            )
-            evidence.append(Evidence("file", "incomplete", "warning", text))
+        evidence += files.incomplete(folder.name, "image")
         bare = ImageFiles(folder.name, f"{folder.name}/data", files.time_ns.tolist(), files.paths)
         stated = [] if file is None else [_stated(values, file, folder.name[-2:], first_size(bare), T_cam0_imu, why)]
         images.append(ImageFiles(bare.name, bare.source, bare.time_ns, bare.files, stated))
@@ -83,6 +80,7 @@ def _imu(path: Path, evidence: list[Evidence]) -> ImuTable | None:
     if not (path / "oxts").is_dir():
         return None
     files = sensor_files(path / "oxts", ".txt")
+    evidence += replace(files, missing=0).incomplete("oxts", "data file")  # missing ones are counted with the unreadable
     rows, times, unreadable = [], [], 0
     for file, time_ns in zip(files.paths, files.time_ns.tolist(), strict=True):
         values = read_oxts(file)
