@@ -13,8 +13,10 @@ from boxplus.sensors.satellites.gnss import NO_FIX, GnssFixes
 _COLUMNS = 30
 _ACCEL, _GYRO = slice(11, 14), slice(17, 20)
 _POSITION_ACCURACY, _POSITION_MODE = 23, 27
-_WITHOUT_SATELLITES = (0, 1, 2)  # position modes: none, searching, velocities only; the position is dead reckoning
-_DIFFERENTIAL = (4, 5, 6)  # with a base station: DGPS, RTK float and integer
+# Position modes (OxTS, NCOM Data Format, measurement modes). None, searching, no data, blanked; and velocities only, live and
+# processed later (PP, gx, ix): the position is dead reckoning.
+_WITHOUT_SATELLITES = (0, 1, 2, 10, 11, 12, 20, 25)
+_DIFFERENTIAL = (4, 5, 6, 14, 15, 16, 22, 23, 24, 27, 28, 29)  # with a base station: DGPS, RTK float and integer, in all of these
 _HEIGHT_FACTOR = 2.0  # what satellites tell of heights, against what they tell of places
 
 
@@ -36,7 +38,7 @@ def oxts_fixes(files: Sequence[Path], time_ns: NDArray[np.int64]) -> GnssFixes:
         sigma = float(values[_POSITION_ACCURACY])
         if sigma > 0.0:
             covariances[row] = sigma**2 * np.diag([1.0, 1.0, _HEIGHT_FACTOR**2])
-        mode = int(values[_POSITION_MODE])
+        mode = values[_POSITION_MODE]  # NaN is none of these
         states.append(NO_FIX if mode in _WITHOUT_SATELLITES else 2 if mode in _DIFFERENTIAL else 0)
     return GnssFixes.from_arrays(time_ns, positions, covariances, np.array(states, np.int8))
 

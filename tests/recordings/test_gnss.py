@@ -70,3 +70,16 @@ def test_rows_of_the_oxts(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diagonal(fixes.covariance[0]), [0.0025, 0.0025, 0.01])
     assert fixes.has_covariance.tolist() == [True, True, False]
     assert dict(fixes.rejected) == {"no fix": 1, "not finite": 1}
+
+
+def test_modes_without_a_position_of_their_own_are_no_fixes(tmp_path: Path) -> None:
+    """Blanked, without data, velocities only; and a mode that is no number tells nothing, which once ended the run at its end."""
+    files = []
+    for k, mode in enumerate([10, 11, 12, 20, 25, 16, np.nan, 3]):
+        row = np.zeros(30)
+        row[:3], row[23], row[27] = (49.0, 8.4, 115.0 + k), 0.05, mode
+        files.append(tmp_path / f"{k}.txt")
+        files[-1].write_text(" ".join(map(str, row)))
+    fixes = oxts_fixes(files, np.arange(len(files)))
+    assert fixes.lat_lon_alt[:, 2].tolist() == [120.0, 121.0, 122.0] and fixes.status.tolist() == [2, 0, 0]
+    assert dict(fixes.rejected) == {"no fix": 5}
