@@ -30,6 +30,7 @@ from boxplus.runs.lidar_inertial.summary import RunSummary, read_summary
 from boxplus.runs.refinement.closed_run import ClosedRun, is_closed_run, read_closed_run
 from boxplus.runs.refinement.config import RefineRunConfig, dump_refine_config
 from boxplus.runs.refinement.folder import RefineFolder
+from boxplus.runs.refinement.moved import moved_by
 from boxplus.runs.refinement.summary import MapSharpness, RefinedReceiver, RefineSummary
 from boxplus.runs.run_folder import RunFolder
 from boxplus.runs.run_loop import peak_memory_mb, versions
@@ -46,7 +47,6 @@ Floats = NDArray[np.float64]
 
 _FEWEST_SCANS = 20
 _DOUBTED = 5.0  # standard deviations of the run's, by which a pose moved
-_LEAST_SIGMA_M = 0.002
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -344,9 +344,9 @@ class _RefineRun:
         if trajectory.covariance is None:
             return None
         rows = np.searchsorted(trajectory.times, finished.time_ns[scans])
-        shift = (found.after.T_world_imu - found.before.T_world_imu)[scans, 4:]
-        sigma = np.sqrt(np.einsum("nii->ni", trajectory.covariance[rows])[:, 3:].max(axis=1)) + _LEAST_SIGMA_M
-        most = float((np.linalg.norm(shift, axis=1) / sigma).max())
+        before, after = found.before.T_world_imu[scans], found.after.T_world_imu[scans]
+        closed = self._run.closed
+        most = moved_by(before, after, trajectory.covariance[rows], None if closed is None else closed.summary.gnss)
         if most <= _DOUBTED:
             return None
         return f"poses moved by up to {most:.0f} standard deviations of what the run claimed: one of the two is wrong"

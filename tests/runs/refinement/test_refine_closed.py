@@ -67,6 +67,7 @@ def test_it_says_what_loops_and_satellites_came_to(refined: Refined) -> None:
     assert summary.loops == loops >= 1
     assert summary.loops_contradicted == 0 and 0 <= summary.loops_told_by_planes <= loops
     assert summary.receiver is not None and summary.receiver.fixes > 5
+    assert summary.doubt is None  # nothing holds the first pose, and all of them moved within what the place is known to
     assert summary.receiver.lever_arm_sigma_m == (0.0, 0.0, 0.0)  # the recording has it
     np.testing.assert_allclose(summary.receiver.lever_arm_m, RECEIVER.lever)
     assert 0.0 < summary.receiver.heading_sigma_deg < 2.0 and 0.0 < summary.receiver.position_sigma_m < 0.5
