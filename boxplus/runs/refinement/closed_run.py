@@ -19,10 +19,14 @@ from boxplus.runs.slam.gnss_output import located, read_origin
 from boxplus.runs.slam.graph_file import read_graph
 from boxplus.runs.slam.summary import SlamSummary, read_slam_summary
 from boxplus.runs.storage.output_folder import SUMMARY, program_of
+from boxplus.sensors.satellites.geodesy import EnuFrame
+from boxplus.systems.georeference.georeference import Georeference
 from boxplus.systems.refinement.outside.evidence import Receiver, RunFixes, RunLoops
 from boxplus.systems.slam.outcome import SlamOutcome
 
 Floats = NDArray[np.float64]
+
+_SAME_MIDDLE_M = 1e-3  # of fixes as georeference.yaml has it, which keeps every digit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +44,11 @@ class ClosedRun:
     outcome: SlamOutcome
     trajectory: Trajectory
     odometry: Trajectory
+
+    @property
+    def is_located(self) -> bool:
+        """Whether positions by satellite say where it is."""
+        return self.folder.georeference.is_file()
 
     def loops(self) -> RunLoops | None:
         """The loops that the run rests on; None without."""
@@ -69,11 +78,11 @@ class ClosedRun:
         if origin is None:
             return None
         found = located(recording, self.folder, self.outcome, self.config)
-        if found is None or found.fit is None:
-            said = "a recording without fixes" if found is None else f"{found.refusal}"
+        said = _objection(found, origin)
+        if said is not None or found is None or found.fit is None:
             raise InputError(
                 "the positions by satellite that the run was laid onto the Earth by",
-                said,
+                f"{said}",
                 f"give the same recording, or refine {self.folder.odometry.path}, without loops and fixes",
             )
         fit, gnss = found.fit, self.config.gnss
@@ -88,6 +97,17 @@ class ClosedRun:
             delay_sigma=gnss.delay_sigma,
             vertical_sigma=self.config.slam.gravity_sigma,
         )
+
+
+def _objection(found: Georeference | None, origin: EnuFrame) -> str | None:
+    """Why these are not the fixes that a run with that origin rests on; None where nothing says so."""
+    if found is None:
+        return "a recording without fixes"
+    if found.frame is None or found.contradiction is not None:
+        return f"{found.refusal or found.contradiction}"
+    # The origin is the middle of the fixes: those of another receiver, or reckoned anew, have another one.
+    away = np.linalg.norm(origin.to_enu([[found.frame.latitude, found.frame.longitude, found.frame.altitude]]))
+    return f"others, whose middle lies {away:.3g} m away from that of these" if away > _SAME_MIDDLE_M else None
 
 
 def is_closed_run(folder: Path) -> bool:

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from boxplus.errors import InputError
 from boxplus.formats.trajectory import read_trajectory
 from boxplus.recordings import open_recording
+from boxplus.runs.refinement.closed_run import read_closed_run
 from boxplus.runs.refinement.folder import claim_refine_folder
 from boxplus.runs.refinement.refine_run import RefineResult, read_odometry_run, refine_run
 from boxplus.runs.slam.config import load_slam_config
@@ -26,6 +28,7 @@ from tests.systems.slam.drives import ate
 
 @dataclass(frozen=True)
 class Refined:
+    bag: Path
     slam: Path
     folder: Path
     result: RefineResult
@@ -39,7 +42,7 @@ def refined(tmp_path_factory: pytest.TempPathFactory) -> Refined:
         run_slam(recording, base / "slam", load_slam_config(settings=SETTINGS))
     with claim_refine_folder(base / "out", base / "slam") as claimed:
         result = refine_run(read_odometry_run(base / "slam"), claimed)
-    return Refined(base / "slam", base / "out", result)
+    return Refined(bag, base / "slam", base / "out", result)
 
 
 @pytest.mark.slow
@@ -97,3 +100,19 @@ def test_fixes_that_are_gone_are_not_left_out_in_silence(refined: Refined, tmp_p
         ),
     ):
         refine_run(run, claimed, recording=bag)
+
+
+def test_fixes_that_are_others_end_it(refined: Refined, tmp_path: Path) -> None:
+    """Of another base station, say: the map went along with them, by 111 m, under the origin of the run."""
+    closed = read_closed_run(refined.slam)
+    assert closed.is_located
+    place = tmp_path / "slam"
+    shutil.copytree(refined.slam, place)
+    file = place / "georeference.yaml"
+    told = yaml.safe_load(file.read_text())
+    told["origin"]["latitude_deg"] += 1e-5
+    file.write_text(yaml.safe_dump(told))
+    with open_recording(refined.bag) as recording:
+        assert closed.fixes(recording) is not None
+        with pytest.raises(InputError, match=r"laid onto the Earth by – got others, whose middle lies 1\.11 m away"):
+            read_closed_run(place).fixes(recording)
