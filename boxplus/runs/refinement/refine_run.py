@@ -102,8 +102,10 @@ def read_odometry_run(folder: str | Path) -> OdometryRun:
         raise InputError("a run that has come to its end", summary.describe_state(), "let it finish, or run it again")
     if not summary.has_imu:
         raise InputError("a run with an IMU", f"one of a LiDAR alone in {path}", "refine runs of LiDAR and IMU")
-    if summary.contradiction is not None:
-        raise InputError("a run that can be trusted", summary.contradiction, "repair that and run 'boxplus lio' again")
+    is_located = closed is not None and closed.is_located  # where the odometry alone did not know its place, satellites tell it
+    contradiction = summary.contradiction_of_sensors if is_located else summary.contradiction
+    if contradiction is not None:
+        raise InputError("a run that can be trusted", contradiction, "repair that and run 'boxplus lio' again")
     if summary.extrinsic.source == "identity":
         raise InputError(
             "a run in which the mounting of the LiDAR is known", summary.extrinsic.text, "run 'boxplus lio' with --T-imu-lidar"
@@ -118,7 +120,7 @@ def read_odometry_run(folder: str | Path) -> OdometryRun:
     times = trajectory.times
     if len(times) != len(log) or not np.array_equal(times, log.time_ns):
         raise InputError("the same scans in trajectory.csv and scans.csv", f"others in {path}", "run 'boxplus lio' again")
-    if is_mostly_unshown(log.status) and (closed is None or not closed.folder.georeference.is_file()):
+    if is_mostly_unshown(log.status) and not is_located:
         raise InputError(
             "a run whose surroundings showed every direction in half of its scans at least",
             f"{np.count_nonzero(log.status != 'ok')} of {len(log)} scans that were weak or lost in {path}",

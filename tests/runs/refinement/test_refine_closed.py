@@ -116,3 +116,19 @@ def test_fixes_that_are_others_end_it(refined: Refined, tmp_path: Path) -> None:
         assert closed.fixes(recording) is not None
         with pytest.raises(InputError, match=r"laid onto the Earth by – got others, whose middle lies 1\.11 m away"):
             read_closed_run(place).fixes(recording)
+
+
+def test_a_place_that_only_satellites_know_is_refined(refined: Refined, tmp_path: Path) -> None:
+    """The run is trusted, as they tell where it ends; that of its odometry alone is not."""
+    place = tmp_path / "slam"
+    shutil.copytree(refined.slam, place)
+    file = place / "odometry" / "run.json"
+    facts = json.loads(file.read_text())
+    said = "it is not known where the run ends"
+    file.write_text(json.dumps(facts | {"contradiction": said, "unknown_position": said}))
+    assert read_odometry_run(place).closed is not None
+    with pytest.raises(InputError, match=said):
+        read_odometry_run(place / "odometry")
+    file.write_text(json.dumps(facts | {"contradiction": "the gyroscope is wrong", "unknown_position": said}))
+    with pytest.raises(InputError, match="gyroscope"):
+        read_odometry_run(place)
