@@ -21,6 +21,7 @@ from boxplus.maps.tiles.voxel_thinning import first_per_voxel
 from boxplus.maps.tiles.writer import TileWriter
 from boxplus.runs.sessions.config import MergeConfig, dump_merge_config
 from boxplus.runs.sessions.folder import ClaimedMerge, MergeFolder, claim_merge_folder
+from boxplus.runs.sessions.frame import frame_of
 from boxplus.runs.sessions.joined import doubts_of_joining, merge_facts, write_session_trajectory
 from boxplus.runs.sessions.repeated import refuse_repeated
 from boxplus.runs.sessions.session_run import SessionRun, open_session_run, session_names
@@ -125,7 +126,7 @@ def _write(
     write_encounters(own.encounters, alignment.meetings, [run.session.name for run in runs])
     if len(world.members) == 1:
         return summary
-    update = _write_map(own, runs, world, config, remove_dynamic)
+    update = _write_map(own, runs, world, config, remove_dynamic) | {"frame": frame_of(runs[world.members[0]])}
     for number, T in zip(world.members, world.T_world_map, strict=True):
         write_session_trajectory(own.sessions, runs[number], T)
     return summary.model_copy(update=update)

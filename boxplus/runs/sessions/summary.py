@@ -27,6 +27,15 @@ class SessionFacts(Part):
     doubt: str | None = Field(None, description="why the run itself is not to be trusted")
 
 
+class FrameFacts(Part):
+    """What gives a joint map its frame."""
+
+    session: str = Field(description="the first one in the map, in whose frame it is")
+    time_ns: int = Field(description="of the first pose of that session's run")
+    T_frame_imu: list[float] = Field(description="[qw, qx, qy, qz, x, y, z] of that pose in the run's own frame")
+    first_points: list[str | None] | None = Field(None, description="digests of the points of its first scan, by shells")
+
+
 class MergeSummary(Part):
     """The facts of a joint map."""
 
@@ -34,6 +43,7 @@ class MergeSummary(Part):
     versions: dict[str, str]
     created: datetime
     sessions: list[SessionFacts]
+    frame: FrameFacts | None = Field(None, description="null where no two sessions were joined")
     encounters_looked_at: int = 0
     encounters_accepted: int = 0
     remove_dynamic: bool = Field(False, description="whether what was seen through was looked for")

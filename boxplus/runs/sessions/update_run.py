@@ -9,6 +9,7 @@ from pathlib import Path
 from boxplus.errors import InputError
 from boxplus.runs.sessions.config import MergeConfig
 from boxplus.runs.sessions.folder import ClaimedMerge, MergeFolder, claim_joint_map
+from boxplus.runs.sessions.frame import refuse_another_frame
 from boxplus.runs.sessions.joined import doubts_of_joining
 from boxplus.runs.sessions.merge_run import MergeResult, merge_runs
 from boxplus.runs.sessions.repeated import refuse_repeated
@@ -56,8 +57,8 @@ def update_map(
         progress: called with every pair of sessions.
 
     Raises:
-        InputError: no joint map; a run of it that is gone; a run that is in it already; another process that is at it; what
-            `merge_runs` refuses.
+        InputError: no joint map; a run of it that is gone, or another one in the place of that which gives it its frame; a run
+            that is in it already; another process that is at it; what `merge_runs` refuses.
         OutputError: the disk is full; the earlier map stays whole.
     """
     with claim_joint_map(merged) as (claimed, before):
@@ -84,6 +85,7 @@ def _updated(
     config = load_settings(MergeConfig, own.config)
     runs = [open_session_run(path, name) for path, name in zip(paths, session_names(paths), strict=True)]
     refuse_repeated({run.session.name: run.identity for run in runs})
+    refuse_another_frame(own.path, before.frame, runs[0])
     sessions = [run.session for run in runs]
     alignment = align_sessions(sessions, config.sessions, progress=progress)
     # Runs that met each other only may be more than the map has: that is no reason to leave it.

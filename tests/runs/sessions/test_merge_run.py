@@ -211,6 +211,50 @@ def test_an_update_from_which_one_of_the_map_would_go_leaves_it_alone(
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
 
 
+def test_an_update_stays_in_its_frame(
+    runs: tuple[list[Path], list[DriftingDrive]],
+    merged: tuple[Path, MergeResult],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A first run that was made again from later on moved the map by as much, with exit code 0."""
+    folders, out, monday = runs[0], tmp_path / "out", tmp_path / "monday"
+    shutil.copytree(merged[0], out)
+    shutil.copytree(folders[0], monday)
+    facts = json.loads((out / "run.json").read_text())
+    facts["sessions"][0]["run"] = str(monday)
+    (out / "run.json").write_text(json.dumps(facts))
+    asked: list[int] = []
+
+    def align(*_: object, **__: object) -> SessionAlignment:
+        asked.append(1)
+        raise RuntimeError
+
+    monkeypatch.setattr("boxplus.runs.sessions.update_run.align_sessions", align)
+    with pytest.raises(RuntimeError):
+        update_map(out, [folders[2]])
+    assert asked  # as it was
+    rows = (monday / "trajectory.csv").read_text().splitlines(keepends=True)
+    (monday / "trajectory.csv").write_text("".join([rows[0], *rows[3:]]))
+    with pytest.raises(InputError, match=r"which begins \+0\.5 s later – put the earlier one back"):
+        update_map(out, [folders[2]])
+    facts["frame"]["T_frame_imu"][4] += 14.0
+    (out / "run.json").write_text(json.dumps(facts))
+    (monday / "trajectory.csv").write_text("".join(rows))
+    with pytest.raises(InputError, match=r"which begins 14 m and 0° away in its frame"):
+        update_map(out, [folders[2]])
+    facts["frame"]["T_frame_imu"][4] -= 14.0
+    facts["frame"]["first_points"] = ["another", None]
+    (out / "run.json").write_text(json.dumps(facts))
+    odometry = monday / "odometry" / "run.json"
+    own = json.loads(odometry.read_text())
+    own["recording"]["first_points"] = ["this one", "that one"]
+    odometry.write_text(json.dumps(own))
+    with pytest.raises(InputError, match="which begins with other points"):
+        update_map(out, [folders[2]])
+    assert len(asked) == 1
+
+
 def test_an_update_goes_on_although_more_runs_met_elsewhere(
     runs: tuple[list[Path], list[DriftingDrive]], merged: tuple[Path, MergeResult], monkeypatch: pytest.MonkeyPatch
 ) -> None:
