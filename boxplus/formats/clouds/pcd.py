@@ -110,7 +110,10 @@ def _read(file: BinaryIO, path: Path, everything: bool) -> PointCloud:
                 raise InputError("a PCD header line", f"{line[:60]!r} ({path}, line {number})", "correct the header")
             header[words[0]], at[words[0]] = words[1:], number
     names = header.get("FIELDS", [])
-    count = _integer(header, at, "POINTS", path) if "POINTS" in header else _integer(header, at, "WIDTH", path)
+    if "POINTS" in header:
+        count = _integer(header, at, "POINTS", path)
+    else:  # rows of an organised cloud, which an unorganised one has a single one of
+        count = _integer(header, at, "WIDTH", path) * (_integer(header, at, "HEIGHT", path) if "HEIGHT" in header else 1)
     repeats = header.get("COUNT", ["1"] * len(names))
     kinds, sizes = header.get("TYPE", []), header.get("SIZE", [])
     try:

@@ -194,6 +194,15 @@ def test_ascii_and_padded_pcd(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.intensity, cloud.intensity)
 
 
+def test_rows_of_an_organised_pcd_count_where_its_points_are_not_said(tmp_path: Path) -> None:
+    """Only the first row was read, and the others were left out in silence."""
+    path = tmp_path / "a.pcd"
+    path.write_text(PCD.replace("WIDTH 2\nHEIGHT 1", "WIDTH 1\nHEIGHT 2").replace("POINTS 2\n", ""))
+    np.testing.assert_array_equal(read_pcd(path).points, [[1, 2, 3], [4, 5, 6]])
+    path.write_text(PCD.replace("HEIGHT 1\n", "").replace("POINTS 2\n", ""))
+    assert len(read_pcd(path)) == 2
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
