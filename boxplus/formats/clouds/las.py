@@ -155,7 +155,8 @@ def read_survey(path: str | Path) -> tuple[PointCloud, NDArray[np.float64]]:
     a position in the file is `origin + points`.
 
     Raises:
-        InputError: as `read_las`; coordinates in degrees, where the file says so; an extent that float32 cannot hold.
+        InputError: as `read_las`; coordinates in degrees, in feet or from the middle of the Earth, where the file says
+            so; an extent that float32 cannot hold.
 
     Example:
         `cloud, origin = read_survey("survey.laz"); (origin + cloud.points).mean(axis=0)`
@@ -168,11 +169,27 @@ def read_survey(path: str | Path) -> tuple[PointCloud, NDArray[np.float64]]:
             crs = cloud.header.parse_crs()
         except faults:  # what pyproj raises; the file names none that is known, and is taken as it is
             crs = None
-        if crs is not None and crs.is_geographic:
-            raise InputError("coordinates in metres", f"{crs.name}, in degrees ({path})", "convert the file to UTM")
+        if crs is not None:
+            _refuse_other_coordinates(crs, source)
     origin = np.array([_nearby(values) for values in columns])
     local = [values - offset for values, offset in zip(columns, origin, strict=True)]
     return PointCloud(as_points(local, source), intensity), origin
+
+
+def _refuse_other_coordinates(crs: Any, path: Path) -> None:
+    """What a file says itself of its coordinates is neither guessed nor passed over."""
+    if crs.is_geographic:
+        raise InputError("coordinates in metres", f"{crs.name}, in degrees ({path})", "convert the file to UTM")
+    if crs.is_geocentric:
+        raise InputError("z up", f"{crs.name}, from the middle of the Earth ({path})", "convert the file to UTM")
+    units = {axis.name: axis for axis in crs.axis_info if axis.unit_conversion_factor != 1.0}  # heights may be in another one
+    if units:
+        said = ", ".join(f"{name} in {axis.unit_name}" for name, axis in units.items())
+        factor = next(iter(units.values())).unit_conversion_factor
+        raise InputError(
+            "coordinates in metres along all axes", f"{crs.name}: {said} ({path})",
+            f"convert the file to UTM and heights in metres, or multiply these by {factor:.10g} and name no reference system",
+        )  # fmt: skip
 
 
 def _nearby(values: NDArray[np.float64]) -> float:

@@ -131,11 +131,11 @@ def test_surveys_keep_their_millimetres_about_an_origin_nearby(tmp_path: Path) -
     random = np.random.default_rng(3)
     xyz = random.uniform((691_200.0, 5_334_100.0, 480.0), (691_700.0, 5_334_900.0, 560.0), (2000, 3))
 
-    def write(name: str, points: np.ndarray, epsg: int | None = None) -> Path:
+    def write(name: str, points: np.ndarray, epsg: int | str | None = None) -> Path:
         header = laspy.LasHeader(version="1.4", point_format=6)
         header.scales, header.offsets = [1e-3] * 3, np.floor(points.min(axis=0))
         if epsg is not None:
-            header.add_crs(pytest.importorskip("pyproj").CRS.from_epsg(epsg))
+            header.add_crs(pytest.importorskip("pyproj").CRS.from_user_input(epsg))
         cloud = laspy.LasData(header)
         cloud.x, cloud.y, cloud.z = points.T
         cloud.write(str(tmp_path / name))
@@ -149,6 +149,14 @@ def test_surveys_keep_their_millimetres_about_an_origin_nearby(tmp_path: Path) -
     np.testing.assert_array_equal(found.points, read_cloud(tmp_path / "near.las").points)
     with pytest.raises(InputError, match="in degrees"):
         read_survey(write("degrees.las", np.array([[11.5, 48.1, 500.0]]), epsg=4326))
+    # Surveys of the United States have heights in feet also where the place is in metres.
+    with pytest.raises(InputError, match=r"Easting in US survey foot, Northing in US survey foot .* by 0\.3048006"):
+        read_survey(write("feet.laz", xyz, epsg=2263))
+    with pytest.raises(InputError, match=r": Gravity-related height in US survey foot \("):
+        read_survey(write("heights.laz", xyz, epsg="EPSG:26918+6360"))
+    with pytest.raises(InputError, match="from the middle of the Earth"):
+        read_survey(write("geocentric.laz", xyz, epsg=4978))
+    assert len(read_survey(write("metres.laz", xyz, epsg="EPSG:25832+5783"))[0]) == len(xyz)
 
 
 def test_ply_files_in_a_map_projection_are_not_read_to_half_a_metre(tmp_path: Path) -> None:
