@@ -225,7 +225,7 @@ class LidarInertialOdometry(Snapshots):
         self._datum = MapDatum(self._x, known if self._gap is None else with_unknown_pose(known), SHARED_ERRORS, FOLLOWED)
         self._mounting = UnknownMounting(self._x, self.config)
         self._mounting_drift = None if self.config.extrinsic_estimation == "off" else MountingDrift(self._x)
-        self._unshown = UnshownMotion(found.unshown_axes, found.time_ns, found.state.p_world_imu, found.doubted)
+        self._unshown = UnshownMotion(found.unshown_axes, found.time_ns, self._x[P : P + 3], found.doubted, found.warning)
         self._weak_spell = WeakSpell(self.config.weak_threshold, None if len(found.unshown_axes) else found.time_ns)
         if found.kind == "static":
             self._standstill = Standstill(joined_imu([first, *rest]), found.state.p_world_imu)
@@ -233,7 +233,7 @@ class LidarInertialOdometry(Snapshots):
         if self._gap is None:  # for good: what flies high sees the ground only, and may do so in rings
             self._one_way = all(sees_one_way(frame.scan.p_lidar) for frame in (first, *rest))
         self._insert(found.state.to_world(self._thinned(p_lidar)[1]))
-        self._warnings = [text for text in (self._gap, found.warning) if text]
+        self._warnings = [] if self._gap is None else [self._gap]
         return [self._estimate(first, p_lidar), *self._advance(rest)]
 
     def _note_search(self) -> None:
@@ -273,8 +273,7 @@ class LidarInertialOdometry(Snapshots):
             after = self._x, update.B if taken else update.B_prior
             self._mounting_drift.follow((x_prior, update.B_prior), after, self._cov[MOUNTING, MOUNTING], correction)
         self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
-        state = NavState.unpack(self._x)
-        map_points_world = state.to_world(map_points)
+        map_points_world = (state := NavState.unpack(self._x)).to_world(map_points)
         self._unshown.look(map_points_world, state.p_world_imu, self.config.map_cell, directions)
         if taken:
             placed, shared = (self._x, points, map_points_world), (self._datum, self._mounting_drift)
@@ -375,7 +374,8 @@ class LidarInertialOdometry(Snapshots):
         timing_s: Mapping[str, float] | None = None,
     ) -> Estimate:
         """What is said of a scan; without an outcome it is the first one, which is exact by definition."""
-        warnings, self._warnings = [*self._warnings, *imu_words(frame, self.config.max_imu_gap)], []
+        words = [*self._unshown.words(self._time_ns), *imu_words(frame, self.config.max_imu_gap)]
+        words, self._warnings = [*self._warnings, *words], []
         pose = self._unshown.widened(self._datum.pose_covariance(self._x), self._time_ns)
         return Estimate(
             time_ns=frame.scan.end_ns,
@@ -392,7 +392,7 @@ class LidarInertialOdometry(Snapshots):
             residual_rms=outcome.posterior.last.residual_rms if outcome else 0.0,
             iterations=outcome.posterior.steps if outcome else 0,
             converged=outcome.posterior.converged if outcome else True,
-            warnings=tuple(warnings),
+            warnings=tuple(words),
             timing_s=dict(timing_s or {}),
             p_lidar=p_lidar,
             intensity=frame.scan.intensity,

@@ -24,6 +24,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import SeenSur
 _SPEED_M_S = 10.0  # standard deviation: what carries a LiDAR does 30 m/s at most
 _SCANS_BETWEEN_LOOKS = 5
 _ONE_AXIS = 0.9  # cosine
+_TOLD_AFTER_S = 10.0  # of a speed that nothing shows; a hand that turns or steps aside mostly shows it sooner, and rested
 _DRIVEN_M = 10.0  # along the axis: a registration that rides along with what it sees shows no way at all
 _AXIS_RAD = 0.005  # how well the planes of a scan show the axis that they leave open
 
@@ -45,6 +46,7 @@ class UnshownMotion:
         time_ns: int = 0,
         p_world: NDArray[np.float64] | None = None,
         doubted: bool = False,
+        text: str = "",
     ) -> None:
         self._axes = np.zeros((0, 3)) if axes is None else axes.copy()
         self._since_ns = time_ns
@@ -52,11 +54,22 @@ class UnshownMotion:
         self._p_start = np.zeros(3) if p_world is None else p_world.copy()
         self._least_way_m = _DRIVEN_M if doubted else 0.0
         self._shown_by = np.zeros((3, 3))  # information about the position, summed
+        self._text, self._told_s = text, 0.0 if doubted else _TOLD_AFTER_S
 
     @property
     def axes(self) -> NDArray[np.float64]:
         """(K, 3) along which the speed is still unknown."""
         return self._axes
+
+    def words(self, time_ns: int) -> list[str]:
+        """The sentence, once: at the start where something spoke against rest, else where nothing has shown it for ten seconds.
+
+        Meanwhile scans are weak and the covariance says how little is known; what has turned out to be rest needs no more words.
+        """
+        if not self._text or not len(self._axes) or time_ns < self._since_ns + round(self._told_s * 1e9):
+            return []
+        told, self._text = self._text, ""
+        return [told]
 
     def mark(self, posterior: Posterior) -> Posterior:
         """The same posterior, the directions closest to these axes called weak, whatever the scan says of them."""

@@ -50,7 +50,6 @@ def constant_speed() -> tuple[Simulation, list[Estimate]]:
 
 def test_a_constant_speed_in_a_corridor_is_never_claimed_to_be_rest() -> None:
     simulation, estimates = constant_speed()
-    assert "do not show whether the platform moves" in estimates[0].warnings[0]
     assert {estimate.status for estimate in estimates[1:]} == {"weak"}
     assert all(max(abs(weak.translation_world[0]) for weak in estimate.weak_directions) > 0.9 for estimate in estimates[1:])
     time_ns = np.array([estimate.time_ns for estimate in estimates])
@@ -90,12 +89,20 @@ def test_what_is_not_known_grows_with_time_along_the_axis() -> None:
     np.testing.assert_array_equal(UnshownMotion().widened(cov, 10**9), cov)
 
 
+def test_it_is_told_once_where_nothing_shows_it_for_long_and_at_once_where_rest_is_doubted() -> None:
+    unshown = UnshownMotion(AXIS[None], 10**9, text="undecided")
+    assert [unshown.words(round(seconds * 1e9)) for seconds in (1.0, 10.9, 11.0, 12.0)] == [[], [], ["undecided"], []]
+    assert UnshownMotion(AXIS[None], 10**9, doubted=True, text="undecided").words(10**9) == ["undecided"]
+    assert UnshownMotion().words(10**12) == []
+
+
 def test_a_surface_across_the_axis_shows_the_speed() -> None:
-    unshown = UnshownMotion(AXIS[None], 0)
+    unshown = UnshownMotion(AXIS[None], 0, text="undecided")
     looked_at(unshown, surface(1))
     assert len(unshown.axes) == 1
     looked_at(unshown, surface(0))
     assert len(unshown.axes) == 0
+    assert unshown.words(10**11) == []
     np.testing.assert_array_equal(unshown.widened(covariance(), 9 * 10**9), covariance())
 
 
