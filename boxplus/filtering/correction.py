@@ -28,7 +28,8 @@ class Correction:
         alone_by_weights: (6, 6) the same as the filter has it, which goes by the weights of the points, see `plane_scatter`.
         lever_arm: root mean square distance of the points [m].
         facing: (3,) mean of the unit vectors towards the points, along the IMU's axes: short where they are all around.
-        deskewed: whether the points were brought to the end of the scan by the prediction.
+        deskewed: how much of what the prediction did wrong the points share that were brought to the end of the scan by it: 1, or
+            less of what their weight says where their motion was guessed; 0 where none.
         renewed: (6, 6) F, of a shift of the scan before how much this one sees; None where only the share of its points is known.
     """
 
@@ -38,7 +39,7 @@ class Correction:
     alone_by_weights: NDArray[np.float64]
     lever_arm: float
     facing: NDArray[np.float64]
-    deskewed: bool = False
+    deskewed: float = 0.0
     renewed: NDArray[np.float64] | None = None
 
     @classmethod
@@ -51,7 +52,7 @@ class Correction:
         *,
         scatter: float = 1.0,
         shared_shift: NDArray[np.float64] = _NO_SHIFT,
-        deskewed: bool = False,
+        deskewed: float = 0.0,
         renewed: NDArray[np.float64] | None = None,
     ) -> Correction:
         """Of a filter.

@@ -13,7 +13,7 @@ from boxplus._jit import kernel
 from boxplus.filtering.nav_state import P, R
 from boxplus.filtering.small_linalg import inverse_root_into, positive_part_into
 
-_ROUNDED = 1e-9  # share of a variance
+_ROUNDED = 1e-9  # of the prior's variances, in which rounding is a millionth of that and noise that is none a thousandth
 
 
 @kernel
@@ -51,7 +51,7 @@ def predict(
     cov_prior: NDArray[np.float64],
     before: NDArray[np.float64],
     laid: bool,
-    deskewed: bool,
+    deskewed: float,
     joint: NDArray[np.float64],
 ) -> None:
     """The joint covariances (2, m + 12, m + 12), in place, from the last scan to the points of this one.
@@ -60,7 +60,7 @@ def predict(
         x_before, x: (36,) states after both scans.
         transition: Φ (m, m), or (0, 0) where it is not known; cov_prior: (m, m). Both as the filter has them.
         before: (m, m) covariance of the filter after the last scan, along the world's axes.
-        laid: whether the third block is l, which goes on; deskewed: whether it becomes u.
+        laid: whether the third block is l, which goes on where there are no points; deskewed: how much of u points share.
     """
     m, known = cov_prior.shape[0], transition.shape[0] > 0
     step, prior, rest = np.zeros((m + 12, m + 12)), np.empty((m, m)), np.empty((m, m))
@@ -72,7 +72,7 @@ def predict(
     move = _rigid(x_before, x)
     for i in range(6):
         step[m + i, m + i] = 1.0
-        if laid and not deskewed:
+        if laid:
             step[m + 6 + i, m + 6 + i] = 1.0
         if not known:
             for j in range(6):
@@ -86,24 +86,24 @@ def predict(
             rest[i, j] = added[i, j]
     if not inverse_root_into(rest, np.empty((m, m))):  # not all of it is noise: the filter has gone on in another way
         positive_part_into(added)
-    if deskewed:
+    if not laid:
         for i in range(6):
             for j in range(m):
-                step[m + 6 + i, j] = 0.5 * (step[i, j] - (move[i, j] if j < 6 else 0.0))
+                step[m + 6 + i, j] = 0.5 * deskewed * (step[i, j] - (move[i, j] if j < 6 else 0.0))
     moved, work = np.empty((m + 12, m + 12)), np.empty((m + 12, m + 12))
     for k in range(2):
         _congruence(step, joint[k], work, moved)
         for i in range(m):
             for j in range(m):
                 moved[i, j] += added[i, j]
-        if deskewed:
+        if not laid:
             for i in range(6):
                 for j in range(6):
-                    moved[m + 6 + i, m + 6 + j] += added[i, j] / 3.0
+                    moved[m + 6 + i, m + 6 + j] += deskewed * deskewed * added[i, j] / 3.0
             for i in range(m):
                 for j in range(6):
-                    moved[i, m + 6 + j] += 0.5 * added[i, j]
-                    moved[m + 6 + j, i] += 0.5 * added[i, j]
+                    moved[i, m + 6 + j] += 0.5 * deskewed * added[i, j]
+                    moved[m + 6 + j, i] += 0.5 * deskewed * added[i, j]
         joint[k] = moved
 
 
@@ -168,27 +168,28 @@ def renew(x: NDArray[np.float64], share: NDArray[np.float64], placed: NDArray[np
     """
     n = joint.shape[1]
     m = n - 12
-    F, noise, apart = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, n))
+    F, noise, seen = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, n))
     turn_into(share, x[R : R + 9], x[R : R + 9], F)
     turn_into(placed, x[R : R + 9], x[R : R + 9], noise)
-    for k in range(2):
-        C = joint[k]
+    for c in range(2):
+        D = joint[c]
         for side in range(2):
             for i in range(6):
                 for j in range(n):
-                    apart[i, j] = C[m + 6 + i, j] - C[m + i, j] if side == 0 else C[j, m + 6 + i] - C[j, m + i]
+                    total = 0.0
+                    for k in range(6):  # so added up, nothing is left of d where F is 1: after a gap it is thousands of metres
+                        d, l = (D[m + k, j], D[m + 6 + k, j]) if side == 0 else (D[j, m + k], D[j, m + 6 + k])
+                        total += ((1.0 if i == k else 0.0) - F[i, k]) * d + F[i, k] * l
+                    seen[i, j] = total
             for i in range(6):
                 for j in range(n):
-                    total = 0.0
-                    for l in range(6):
-                        total += F[i, l] * apart[l, j]
                     if side == 0:
-                        C[m + i, j] += total
+                        D[m + i, j] = seen[i, j]
                     else:
-                        C[j, m + i] += total
+                        D[j, m + i] = seen[i, j]
         for i in range(6):
             for j in range(6):
-                C[m + i, m + j] += noise[i, j]
+                D[m + i, m + j] += noise[i, j]
 
 
 @kernel

@@ -106,12 +106,14 @@ class MapDatum:
             self._local_points *= correction.share_left(x[P : P + 3] - self._x[P : P + 3], turned)
         move_map(self._x, x, self._joint)
         if correction is not None and self._laid:
-            renewed = self._new_share * np.eye(6) if correction.renewed is None else correction.renewed
+            renewed = correction.renewed
+            if renewed is None or self._new_share == 1.0:
+                renewed = self._new_share * np.eye(6)
             placed = positive_part(0.5 * self._shared * (renewed @ correction.alone + correction.alone @ renewed.T))
             renew(x, renewed, placed, self._joint)
             self._laid, self._new_share = False, 0.0
         phi = _NO_TRANSITION if transition is None else transition
-        deskewed = correction is not None and correction.deskewed
+        deskewed = 0.0 if correction is None else float(correction.deskewed)
         predict(self._x, x, phi, cov_prior[:m, :m].copy(), self._filter, self._laid, deskewed, self._joint)
         if correction is not None:
             correct(x, correction.gain[:m].copy(), self._shared * correction.noise[:m, :m], self._joint)

@@ -109,7 +109,7 @@ def _information_on(
     fate: NDArray[np.uint8],
     neighbours: NDArray[np.float32],
 ) -> NDArray[np.float64]:
-    """(6, 6): of the information about the pose that planes carry, what rests on points in `cells` (k,); every n-th is asked."""
+    """(2, 6, 6): information about the pose of every n-th plane, and what of it rests on points in `cells` (k,)."""
     shift = np.uint64(62)  # of a table that is a quarter full at most
     while 4 * len(cells) > 1 << np.int64(np.uint64(64) - shift):
         shift -= _ONE
@@ -121,7 +121,7 @@ def _information_on(
             slot = (slot + _ONE) & mask
         table[slot] = cells[k]
     rotation, mounting, lever = rotation_of(x, R), rotation_of(x, RL), triple_of(x, PL)
-    A, h, corners = np.zeros((6, 6)), np.empty(6), neighbours.shape[1]
+    A, h, corners = np.zeros((2, 6, 6)), np.empty(6), neighbours.shape[1]
     stride = max(p_lidar.shape[0] // _ASKED, 1)
     for n in range(0, p_lidar.shape[0], stride):
         if fate[n] != USED:
@@ -134,14 +134,14 @@ def _information_on(
             while table[slot] != _NO_CELL and table[slot] != cell:
                 slot = (slot + _ONE) & mask
             count += table[slot] == cell
-        if count == 0:
-            continue
         s, u = placed(mounting, lever, triple_of(p_lidar[n], 0)), triple_of(planes[n], 0)
-        turn, weight = cross(s, turned_back(rotation, u)), planes[n, WEIGHT] * stride * count / corners
+        turn, weight, share = cross(s, turned_back(rotation, u)), planes[n, WEIGHT], count / corners
         h[0], h[1], h[2], h[3], h[4], h[5] = turn[0], turn[1], turn[2], u[0], u[1], u[2]
         for i in range(6):
             for j in range(6):
-                A[i, j] += weight * h[i] * h[j]
+                said = weight * h[i] * h[j]
+                A[0, i, j] += said
+                A[1, i, j] += share * said
     return A
 
 
@@ -201,7 +201,7 @@ class FirstArrivals:
         fate: NDArray[np.uint8],
         neighbours: NDArray[np.float32],
     ) -> NDArray[np.float64]:
-        """(6, 6): of the information about the pose at x (36,) that a scan has, what rests on points of the scan before.
+        """(2, 6, 6): what some planes of a scan say of the pose at x (36,), and what of that rests on points of the scan before.
 
         Args:
             origin: (3,) of the map.

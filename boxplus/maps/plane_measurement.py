@@ -62,6 +62,7 @@ class PlaneMeasurement:
             those who have a prediction; registrations that nothing else steadies do without.
 
     Attributes:
+        weight: as given.
         lever_arm: root mean square distance of the points from the LiDAR [m], 0.1 at least.
         facing: (3,) mean of the unit vectors towards the points, LiDAR frame: zero all around, 0.9 long in a cone of 70 degrees.
     """
@@ -83,7 +84,7 @@ class PlaneMeasurement:
         self._cell = tree.cell_size or config.map_cell
         self._config = config
         self._with_extrinsic = with_extrinsic
-        self._weight = weight
+        self.weight = weight
         self._confirm = confirm
         self._neighbours = np.zeros((n, NEIGHBOURS, 3), dtype=np.float32)
         self._reach = np.zeros((n, 4), dtype=np.float32)
@@ -125,15 +126,15 @@ class PlaneMeasurement:
             self._directions = pose_directions(self._about_pose, noise, self.lever_arm, threshold)
         used = int(sums[0])
         rms = float(np.sqrt(max(sums[1], 0.0) / used)) if used else 0.0
-        A, b = A * self._weight, b * self._weight
-        return Information(A.sum(axis=0), b.sum(axis=0), self._pull * self._weight, self._directions, used, rms), A, b
+        A, b = A * self.weight, b * self.weight
+        return Information(A.sum(axis=0), b.sum(axis=0), self._pull * self.weight, self._directions, used, rms), A, b
 
     def scatter(self, x: NDArray[np.float64]) -> float:
         """Of the variance that the information states, what the residuals at x (36,) bear out, 0.05 to 1: `plane_scatter`.
 
         All of it where a weight says that points are not where they seem: that is an error they share, and no residual shows.
         """
-        return 1.0 if self._weight < 1.0 else float(plane_scatter(x, self._p_lidar, self._planes, self._fate, self._about_pose))
+        return 1.0 if self.weight < 1.0 else float(plane_scatter(x, self._p_lidar, self._planes, self._fate, self._about_pose))
 
     def renewal(self, x: NDArray[np.float64], arrivals: FirstArrivals, share: float) -> NDArray[np.float64]:
         """F (6, 6): of a shift of the map against the pose at x (36,), what this scan sees if only the last one's points shift.
@@ -145,8 +146,9 @@ class PlaneMeasurement:
             arrivals: of the map.
             share: of the map that is new, for directions of which nothing tells.
         """
-        A = self._about_pose
-        newest = arrivals.information_on_newest(x, self._tree.origin, self._p_lidar, self._planes, self._fate, self._neighbours)
+        A, newest = arrivals.information_on_newest(
+            x, self._tree.origin, self._p_lidar, self._planes, self._fate, self._neighbours
+        )
         scale = np.repeat([self.lever_arm**2, 1.0], 3)
         little = np.diag(_UNTOLD * max(float(np.mean(A.diagonal() / scale)), 1e-12) * scale)
         return np.asarray(np.linalg.solve(A + little, newest + share * little), dtype=np.float64)

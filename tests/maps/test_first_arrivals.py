@@ -104,12 +104,13 @@ def test_information_that_rests_on_the_points_of_the_last_scan(seed: int, count:
     u = random.normal(size=(count, 3))
     planes[:, :3], planes[:, WEIGHT] = u / np.linalg.norm(u, axis=1)[:, None], random.uniform(1.0, 2.0, count)
     fate = random.integers(0, 3, count).astype(np.uint8)
-    stride = max(count // 1000, 1)
-    expected = np.zeros((6, 6))
-    for n in range(0, count, stride):
+    expected = np.zeros((2, 6, 6))
+    for n in range(0, count, max(count // 1000, 1)):
+        if fate[n] != USED:
+            continue
         s = x.R_imu_lidar @ p_lidar[n] + x.p_imu_lidar
         h = np.concatenate([np.cross(s, x.R_world_imu.T @ planes[n, :3]), planes[n, :3]])
-        share = is_new[chosen[n]].mean() if fate[n] == USED else 0.0
-        expected += stride * share * planes[n, WEIGHT] * np.outer(h, h)
+        said = planes[n, WEIGHT] * np.outer(h, h)
+        expected += np.stack([said, is_new[chosen[n]].mean() * said])
     found = arrivals.information_on_newest(x.pack(), tree.origin, p_lidar, planes, fate, neighbours)
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)

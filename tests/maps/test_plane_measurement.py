@@ -183,3 +183,6 @@ def test_what_a_scan_sees_of_the_map_is_new_where_its_planes_rest_on_the_last_sc
     assert F[5, 5] > 0.9 and F[0, 0] < 0.9  # height; roll is held by the walls too
     assert abs(F[4, 4]) < 0.1 and abs(F[2, 2]) < 0.2
     assert F[3, 3] == pytest.approx(share, abs=0.1)
+    anew = FirstArrivals(0.25)
+    anew.insert_into(IkdTree(cell_size=0.25), tree.points(), 0)
+    assert np.allclose(measurement.renewal(x.pack(), anew, 1.0), np.eye(6), atol=1e-9)

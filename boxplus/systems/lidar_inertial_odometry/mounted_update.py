@@ -54,10 +54,10 @@ class MountedUpdate:
         """
         posterior, x = self.posterior, self.posterior.x
         facing, scatter = x[RL : RL + 9].reshape(3, 3) @ measurement.facing, measurement.scatter(x)
-        directions, renewed = posterior.last.directions, measurement.renewal(x, arrivals, share)
         return Correction.of(
-            self.cov, posterior.A, directions, facing, scatter=scatter, shared_shift=stamped.shift, deskewed=True, renewed=renewed
-        )
+            self.cov, posterior.A, posterior.last.directions, facing, scatter=scatter, shared_shift=stamped.shift,
+            deskewed=np.sqrt(measurement.weight), renewed=measurement.renewal(x, arrivals, share),
+        )  # fmt: skip
 
 
 def mounted_update(

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from boxplus.filtering.nav_state import T_V, TANGENT, P, V, boxplus_into
 from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import MOUNTING, mounting_known
 
 _ZERO_VELOCITY_SIGMA = 0.01  # m/s
 _MAX_DEVIATIONS = 5.0  # standard deviations of what the IMU's noise sums up to
@@ -44,7 +45,7 @@ class Standstill:
     def update(self, imu: ImuSamples, seconds: float, x: NDArray[np.float64], cov: NDArray[np.float64]) -> NDArray[np.float64]:
         """If the platform still rests, apply v = 0 to the state x (36,) and its covariance (24, 24), in place.
 
-        Returns what that leaves of the errors of the state, (24, 24).
+        Returns what that leaves of the errors of the state, (24, 24), with the mounting known.
 
         Args:
             imu: the samples of a scan; seconds: how long it took [s].
@@ -55,7 +56,8 @@ class Standstill:
             self.active = False
             return np.eye(TANGENT)
         columns = cov[:, T_V : T_V + 3]
-        innovation = cov[T_V : T_V + 3, T_V : T_V + 3] + _ZERO_VELOCITY_SIGMA**2 * np.eye(3)
+        noise = _ZERO_VELOCITY_SIGMA**2 * np.eye(3)
+        innovation = cov[T_V : T_V + 3, T_V : T_V + 3] + noise
         gain = np.linalg.solve(innovation, columns.T).T
         delta = np.zeros(TANGENT)
         delta[:] = -gain @ x[V : V + 3]
@@ -64,8 +66,11 @@ class Standstill:
         reduce = np.eye(TANGENT)
         reduce[:, T_V : T_V + 3] -= gain
         reduced = reduce @ cov @ reduce.T + _ZERO_VELOCITY_SIGMA**2 * gain @ gain.T
+        known = mounting_known(cov)[0] if cov[MOUNTING, T_V].any() else cov
+        left = np.eye(TANGENT)
+        left[:, T_V : T_V + 3] -= np.linalg.solve(known[T_V : T_V + 3, T_V : T_V + 3] + noise, known[T_V : T_V + 3]).T
         cov[:] = 0.5 * (reduced + reduced.T)
-        return reduce
+        return left
 
     def _sets_off(self, imu: ImuSamples, seconds: float) -> bool:
         """Whether the turns and changes of velocity of the last scans are more than noise, over any of the lengths."""

@@ -7,6 +7,7 @@ import pytest
 
 from boxplus.filtering.nav_state import T_V, TANGENT, NavState, P, V
 from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import mounting_known
 from boxplus.systems.lidar_inertial_odometry.standstill import Standstill
 
 RATE_HZ = 200.0
@@ -88,12 +89,16 @@ def test_while_it_rests_the_velocity_is_zero_and_known() -> None:
 
 @pytest.mark.parametrize("rests", [True, False])
 def test_it_says_what_it_has_left_of_the_errors(rests: bool) -> None:
-    """P⁺ = (I − KH) P⁻, and nothing of it where the platform moves."""
+    """P⁺ = (I − KH) P⁻ with the mounting known, and nothing of it where the platform moves."""
     rng = np.random.default_rng(2)
     still = Standstill(_samples(0.0, 1.0, 2e-3, rng), np.zeros(3))
     root, x = rng.normal(size=(TANGENT, TANGENT)), NavState.identity().pack()
     cov = 1e-4 * root @ root.T
     before = cov.copy()
     left = still.update(_samples(1.0, 0.1, 2e-3, rng, 0.0 if rests else 5.0), 0.1, x, cov)
-    np.testing.assert_allclose(left @ before, cov, atol=1e-9)
+    np.testing.assert_allclose(left[:18, :18] @ mounting_known(before)[0][:18, :18], mounting_known(cov)[0][:18, :18], atol=1e-9)
+    before[18:, :18] = before[:18, 18:] = 0.0
+    cov = before.copy()
+    again = still.update(_samples(1.1, 0.1, 2e-3, rng, 0.0 if rests else 5.0), 0.1, x, cov) if rests else left
+    np.testing.assert_allclose(again @ before, cov if rests else before, atol=1e-9)
     assert (left == np.eye(TANGENT)).all() == (not rests)

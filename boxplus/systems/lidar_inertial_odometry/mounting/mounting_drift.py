@@ -5,7 +5,8 @@ where the IMU's motion and T put it (`unknown_mounting`: the state moves by B δ
 
     E δ,    E = B_pose − F        F: how the pose would have to move with T for the LiDAR to stay
 
-and so does the map that is made of it. With the gain G of a scan, and the share f of the local map that it brings (`map_datum`),
+and so does the map that is made of it. With the gain G of a scan, and the share f of the local map that it brings (of its points:
+that `map_datum` tells it by direction matters where few rings drift, and a mounting is told by all of them),
 
     S ← (I − G)(S + ΔE) + G S_map,    S_map ← (1 − f) S_map + f S
 
