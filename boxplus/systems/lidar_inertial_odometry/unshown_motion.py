@@ -24,7 +24,7 @@ from boxplus.systems.lidar_inertial_agreement.lidar_path.surfaces import SeenSur
 _SPEED_M_S = 10.0  # standard deviation: what carries a LiDAR does 30 m/s at most
 _SCANS_BETWEEN_LOOKS = 5
 _ONE_AXIS = 0.9  # cosine
-_TOLD_AFTER_S = 10.0  # of a speed that nothing shows; a hand that turns or steps aside mostly shows it sooner, and rested
+_TOLD_AFTER_S = 3.0  # of a speed that nothing shows; a hand that turns or steps aside mostly shows it sooner, and rested
 _DRIVEN_M = 10.0  # along the axis: a registration that rides along with what it sees shows no way at all
 _AXIS_RAD = 0.005  # how well the planes of a scan show the axis that they leave open
 
@@ -62,7 +62,7 @@ class UnshownMotion:
         return self._axes
 
     def words(self, time_ns: int) -> list[str]:
-        """The sentence, once: at the start where something spoke against rest, else where nothing has shown it for ten seconds.
+        """The sentence, once: at the start where something spoke against rest, else where nothing has shown it for three seconds.
 
         Meanwhile scans are weak and the covariance says how little is known; what has turned out to be rest needs no more words.
         """

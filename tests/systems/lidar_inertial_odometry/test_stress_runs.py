@@ -26,10 +26,10 @@ def test_stress_run(scenario: str, duration_s: float | None, metres: float, degr
     assert len(stress.estimates) == stress.simulation.scan_count, "no scan is left out, those of the start included"
     assert "lost" not in stress.status
     assert not stress.odometry.counters
-    assert not stress.warnings
-    if scenario == "stress_drone":  # of the ground below it the rosette sees too little to tell rest from a glide, at first
-        assert stress.odometry.start is not None and "taken as at rest" in stress.odometry.start.warning
-        assert {estimate.status for estimate in stress.estimates[1:6]} == {"weak"}
+    # Of the ground below a hovering drone its rosette sees too little to tell rest from a glide, and the start says so.
+    undecided = [text for text in stress.warnings if "surroundings do not show whether the platform moves" in text]
+    assert len(undecided) == (scenario == "stress_drone")
+    assert stress.warnings == undecided
     assert stress.distance.max() < metres
     assert stress.rotation_error_deg.max() < degrees
 
