@@ -13,7 +13,7 @@ from boxplus._jit import kernel
 from boxplus.filtering.nav_state import P, R
 from boxplus.filtering.small_linalg import inverse_root_into, positive_part_into
 
-_ROUNDED = 1e-9  # of the prior's variances, in which rounding is a millionth of that and noise that is none a thousandth
+_ROUNDED = 1e-9  # of the prior's variances: noise may be negative by so much
 
 
 @kernel
@@ -29,18 +29,19 @@ def move_map(x_before: NDArray[np.float64], x: NDArray[np.float64], joint: NDArr
     """The errors d and l of the map, about where the IMU is now: joint (2, m + 12, m + 12), in place."""
     move, n = _rigid(x_before, x), joint.shape[1]
     for k in range(2):
-        C = joint[k]
         for block in (n - 12, n - 6):
-            for i in range(3):
-                for j in range(n):
-                    C[block + 3 + i, j] += (
-                        move[3 + i, 0] * C[block, j] + move[3 + i, 1] * C[block + 1, j] + move[3 + i, 2] * C[block + 2, j]
-                    )
-            for i in range(3):
-                for j in range(n):
-                    C[j, block + 3 + i] += (
-                        move[3 + i, 0] * C[j, block] + move[3 + i, 1] * C[j, block + 1] + move[3 + i, 2] * C[j, block + 2]
-                    )
+            _move_rows(move, block, joint[k])
+            _move_rows(move, block, joint[k].T)
+
+
+@kernel
+def _move_rows(move: NDArray[np.float64], block: int, C: NDArray[np.float64]) -> None:
+    """Of the six rows of C (n, n) from `block` on, the last three go along with the first three."""
+    for i in range(3):
+        for j in range(C.shape[1]):
+            C[block + 3 + i, j] += (
+                move[3 + i, 0] * C[block, j] + move[3 + i, 1] * C[block + 1, j] + move[3 + i, 2] * C[block + 2, j]
+            )
 
 
 @kernel
@@ -115,27 +116,13 @@ def correct(x: NDArray[np.float64], gain: NDArray[np.float64], noise: NDArray[np
         gain: (m, 6) G; noise: (m, m) covariance of G v. Both about the IMU's axes.
     """
     m, n = gain.shape[0], joint.shape[1]
-    pull, random, apart = np.empty((m, 6)), np.empty((m, m)), np.empty((6, n))
+    pull, random = np.empty((m, 6)), np.empty((m, m))
     turn_into(gain, x[R : R + 9], x[R : R + 9], pull)
     turn_into(noise, x[R : R + 9], x[R : R + 9], random)
     for k in range(2):
         C = joint[k]
-        for side in range(2):
-            for i in range(6):
-                for j in range(n):
-                    if side == 0:
-                        apart[i, j] = C[i, j] - C[m + i, j] - C[m + 6 + i, j]
-                    else:
-                        apart[i, j] = C[j, i] - C[j, m + i] - C[j, m + 6 + i]
-            for i in range(m):
-                for j in range(n):
-                    total = 0.0
-                    for l in range(6):
-                        total += pull[i, l] * apart[l, j]
-                    if side == 0:
-                        C[i, j] -= total
-                    else:
-                        C[j, i] -= total
+        _pull_rows(pull, C)
+        _pull_rows(pull, C.T)
         for i in range(n):
             for j in range(i + 1):
                 mean = 0.5 * (C[i, j] + C[j, i])
@@ -145,18 +132,36 @@ def correct(x: NDArray[np.float64], gain: NDArray[np.float64], noise: NDArray[np
 
 
 @kernel
+def _pull_rows(pull: NDArray[np.float64], C: NDArray[np.float64]) -> None:
+    """The rows of e in C (n, n) less G (m, 6) of those of E e − u − d."""
+    m, n = pull.shape[0], C.shape[1]
+    apart = np.empty((6, n))
+    for i in range(6):
+        for j in range(n):
+            apart[i, j] = C[i, j] - C[m + i, j] - C[m + 6 + i, j]
+    for i in range(m):
+        for j in range(n):
+            total = 0.0
+            for l in range(6):
+                total += pull[i, l] * apart[l, j]
+            C[i, j] -= total
+
+
+@kernel
 def lay_down(joint: NDArray[np.float64]) -> None:
     """The points go where the estimate says: u becomes l = E e − u; joint (2, m + 12, m + 12), in place."""
-    n = joint.shape[1]
-    m = n - 12
     for k in range(2):
-        C = joint[k]
-        for i in range(6):
-            for j in range(n):
-                C[m + 6 + i, j] = C[i, j] - C[m + 6 + i, j]
-        for i in range(6):
-            for j in range(n):
-                C[j, m + 6 + i] = C[j, i] - C[j, m + 6 + i]
+        _lay_rows(joint[k])
+        _lay_rows(joint[k].T)
+
+
+@kernel
+def _lay_rows(C: NDArray[np.float64]) -> None:
+    """The rows of u in C (n, n) become those of the pose less them."""
+    n = C.shape[1]
+    for i in range(6):
+        for j in range(n):
+            C[n - 6 + i, j] = C[i, j] - C[n - 6 + i, j]
 
 
 @kernel
@@ -166,30 +171,33 @@ def renew(x: NDArray[np.float64], share: NDArray[np.float64], placed: NDArray[np
     Args:
         share: (6, 6) F; placed: (6, 6) covariance of F n. Both about the IMU's axes.
     """
-    n = joint.shape[1]
-    m = n - 12
-    F, noise, seen = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, n))
+    m = joint.shape[1] - 12
+    F, noise = np.empty((6, 6)), np.empty((6, 6))
     turn_into(share, x[R : R + 9], x[R : R + 9], F)
     turn_into(placed, x[R : R + 9], x[R : R + 9], noise)
-    for c in range(2):
-        D = joint[c]
-        for side in range(2):
-            for i in range(6):
-                for j in range(n):
-                    total = 0.0
-                    for k in range(6):  # so added up, nothing is left of d where F is 1: after a gap it is thousands of metres
-                        d, l = (D[m + k, j], D[m + 6 + k, j]) if side == 0 else (D[j, m + k], D[j, m + 6 + k])
-                        total += ((1.0 if i == k else 0.0) - F[i, k]) * d + F[i, k] * l
-                    seen[i, j] = total
-            for i in range(6):
-                for j in range(n):
-                    if side == 0:
-                        D[m + i, j] = seen[i, j]
-                    else:
-                        D[j, m + i] = seen[i, j]
+    for k in range(2):
+        C = joint[k]
+        _renew_rows(F, C)
+        _renew_rows(F, C.T)
         for i in range(6):
             for j in range(6):
-                D[m + i, m + j] += noise[i, j]
+                C[m + i, m + j] += noise[i, j]
+
+
+@kernel
+def _renew_rows(F: NDArray[np.float64], C: NDArray[np.float64]) -> None:
+    """The rows of d in C (n, n) become (I − F) d + F l; so added up, kilometres of d leave nothing behind where F is 1."""
+    n = C.shape[1]
+    m, seen = n - 12, np.empty((6, n))
+    for i in range(6):
+        for j in range(n):
+            total = 0.0
+            for k in range(6):
+                total += ((1.0 if i == k else 0.0) - F[i, k]) * C[m + k, j] + F[i, k] * C[m + 6 + k, j]
+            seen[i, j] = total
+    for i in range(6):
+        for j in range(n):
+            C[m + i, j] = seen[i, j]
 
 
 @kernel

@@ -162,7 +162,7 @@ class MapDatum:
         return _turned(self._joint[_MARKED, _POSE, _POSE], x[R : R + 9].reshape(3, 3).T)
 
     def _moved_by(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(m + 12, 6): what a small motion about the IMU at x (36,), of pose and map together, adds to e, d and u."""
+        """(m + 12, 6): what a small motion about the IMU at x (36,), of pose and map together, adds to e, d and l."""
         m = self._followed
         moved = np.zeros((m + 12, 6))
         moved[_POSE] = moved[m : m + 6] = np.eye(6)
