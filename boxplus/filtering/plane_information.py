@@ -216,3 +216,34 @@ def _mirror(A: NDArray[np.float64]) -> None:
     for i in range(A.shape[0]):
         for j in range(i):
             A[i, j] = A[j, i]
+
+
+@kernel
+def shared_information(
+    x: NDArray[np.float64],
+    p_lidar: NDArray[np.float32],
+    planes: NDArray[np.float64],
+    fate: NDArray[np.uint8],
+    counts: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """(2, 6, 6): the information of planes about the pose, and what of it rests on those of their points that count.
+
+    Args:
+        x: (36,) state; p_lidar: (n, 3) deskewed points, LiDAR frame.
+        planes: (n, PLANE) with the weights of `accumulate_planes`; fate: (n,), USED where a point took part.
+        counts: (n, k), of each of the points a plane was laid through.
+    """
+    rotation, mounting, lever = rotation_of(x, R), rotation_of(x, RL), triple_of(x, PL)
+    A, h = np.zeros((2, 6, 6)), np.empty(6)
+    for n in range(p_lidar.shape[0]):
+        if fate[n] != USED:
+            continue
+        s, u = placed(mounting, lever, triple_of(p_lidar[n], 0)), triple_of(planes[n], 0)
+        turn, share = cross(s, turned_back(rotation, u)), counts[n].sum() / counts.shape[1]
+        h[0], h[1], h[2], h[3], h[4], h[5] = turn[0], turn[1], turn[2], u[0], u[1], u[2]
+        for i in range(6):
+            for j in range(6):
+                said = planes[n, 14] * h[i] * h[j]
+                A[0, i, j] += said
+                A[1, i, j] += share * said
+    return A

@@ -21,14 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from boxplus._jit import kernel
-from boxplus.filtering.nav_state import PL, RL, R
-from boxplus.filtering.plane_information import USED
-from boxplus.filtering.triples import cross, placed, rotation_of, triple_of, turned_back
 from boxplus.maps.ikd_tree import IkdTree
-from boxplus.maps.plane_matching import WEIGHT
 
 _SOON_NS = 1_000_000_000
-_ASKED = 1000  # points of a scan, of what they rest on
 _INDEX_BITS = np.uint64(20)
 _INDEX = np.int64(0xFFFFF)
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)  # an odd factor whose product's upper bits depend on all bits of a key
@@ -41,14 +36,10 @@ _TAKEN_BITS, _UPPER, _NO_CELL = 16, np.uint64(48), np.uint64(0xFFFFFFFFFFFFFFFF)
 def _cells_of(points: NDArray[np.float64], size: float, level: np.uint64, cells: NDArray[np.uint64]) -> None:
     """`cells` (n,) of points (n, 3): which cell of this side [m], modulo 2²⁰ on each axis, with the level of the side."""
     for n in range(len(points)):
-        cells[n] = _cell_of(points[n, 0], points[n, 1], points[n, 2], size, level)
-
-
-@kernel(inline=True)
-def _cell_of(x: float, y: float, z: float, size: float, level: np.uint64) -> np.uint64:
-    key = (level << _INDEX_BITS) | np.uint64(np.int64(math.floor(x / size)) & _INDEX)
-    key = (key << _INDEX_BITS) | np.uint64(np.int64(math.floor(y / size)) & _INDEX)
-    return (key << _INDEX_BITS) | np.uint64(np.int64(math.floor(z / size)) & _INDEX)
+        key = level
+        for axis in range(3):
+            key = (key << _INDEX_BITS) | np.uint64(np.int64(math.floor(points[n, axis] / size)) & _INDEX)
+        cells[n] = key
 
 
 @kernel
@@ -97,52 +88,12 @@ def _take(cells: NDArray[np.uint64], table: NDArray[np.uint64]) -> None:
         table[_place_of(cells[n])] = cells[n]
 
 
-@kernel
-def _information_on(
-    cells: NDArray[np.uint64],
-    side: float,
-    level: np.uint64,
-    origin: NDArray[np.float64],
-    x: NDArray[np.float64],
-    p_lidar: NDArray[np.float32],
-    planes: NDArray[np.float64],
-    fate: NDArray[np.uint8],
-    neighbours: NDArray[np.float32],
-) -> NDArray[np.float64]:
-    """(2, 6, 6): information about the pose of every n-th plane, and what of it rests on points in `cells` (k,)."""
-    shift = np.uint64(62)  # of a table that is a quarter full at most
-    while 4 * len(cells) > 1 << np.int64(np.uint64(64) - shift):
-        shift -= _ONE
-    table = np.full(1 << np.int64(np.uint64(64) - shift), _NO_CELL)
-    mask = np.uint64(table.shape[0]) - _ONE
-    for k in range(len(cells)):
-        slot = (cells[k] * _SPREAD) >> shift
-        while table[slot] != _NO_CELL:
-            slot = (slot + _ONE) & mask
-        table[slot] = cells[k]
-    rotation, mounting, lever = rotation_of(x, R), rotation_of(x, RL), triple_of(x, PL)
-    A, h, corners = np.zeros((2, 6, 6)), np.empty(6), neighbours.shape[1]
-    stride = max(p_lidar.shape[0] // _ASKED, 1)
-    for n in range(0, p_lidar.shape[0], stride):
-        if fate[n] != USED:
-            continue
-        count = 0
-        for i in range(corners):
-            q = triple_of(neighbours[n, i], 0)
-            cell = _cell_of(q[0] + origin[0], q[1] + origin[1], q[2] + origin[2], side, level)
-            slot = (cell * _SPREAD) >> shift
-            while table[slot] != _NO_CELL and table[slot] != cell:
-                slot = (slot + _ONE) & mask
-            count += table[slot] == cell
-        s, u = placed(mounting, lever, triple_of(p_lidar[n], 0)), triple_of(planes[n], 0)
-        turn, weight, share = cross(s, turned_back(rotation, u)), planes[n, WEIGHT], count / corners
-        h[0], h[1], h[2], h[3], h[4], h[5] = turn[0], turn[1], turn[2], u[0], u[1], u[2]
-        for i in range(6):
-            for j in range(6):
-                said = weight * h[i] * h[j]
-                A[0, i, j] += said
-                A[1, i, j] += share * said
-    return A
+def _among(cells: NDArray[np.uint64], waiting: NDArray[np.uint64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which of `cells` (n,) are among the `waiting` ones (m,), and which of these among those."""
+    waited, met = np.zeros(len(cells), np.bool_), np.zeros(len(waiting), np.bool_)
+    bits = (2 * len(met) + 1).bit_length()
+    _meet(cells, waiting, np.full(1 << bits, _EMPTY), np.uint64(64 - bits), waited, met)
+    return waited, met
 
 
 class FirstArrivals:
@@ -177,7 +128,7 @@ class FirstArrivals:
             self._taken[:] = _NO_CELL
             self._taken_side = side
         cells = self._in_cells(p_world, side)
-        waited, again = self._seen_again(cells)
+        waited, again = _among(cells, self._cells)
         tree.delete_points(self._points[again])
         self._keep(~again)
         taken = np.empty(len(cells), np.bool_)
@@ -192,39 +143,14 @@ class FirstArrivals:
         self._time_ns = np.concatenate([self._time_ns, np.full(len(first), time_ns)])
         return len(stored), int(np.count_nonzero(again))
 
-    def information_on_newest(
-        self,
-        x: NDArray[np.float64],
-        origin: NDArray[np.float64],
-        p_lidar: NDArray[np.float32],
-        planes: NDArray[np.float64],
-        fate: NDArray[np.uint8],
-        neighbours: NDArray[np.float32],
-    ) -> NDArray[np.float64]:
-        """(2, 6, 6): what some planes of a scan say of the pose at x (36,), and what of that rests on points of the scan before.
-
-        Args:
-            origin: (3,) of the map.
-            p_lidar, planes, fate, neighbours: of all points, as `PlaneMeasurement` has them.
-        """
-        side, level = self._newest_side, self._level_of(self._newest_side)
-        on_newest: NDArray[np.float64] = _information_on(self._newest, side, level, origin, x, p_lidar, planes, fate, neighbours)
-        return on_newest
-
-    def _level_of(self, cell: float) -> np.uint64:
-        return np.uint64(max(round(math.log2(self._largest_cell / cell)), 0))
+    def are_newest(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which points (n, 3) of the map, in the world [m], are in cells where the last scan has left one."""
+        return _among(self._in_cells(points, self._newest_side), self._newest)[0]
 
     def _in_cells(self, p_world: NDArray[np.float64], cell: float) -> NDArray[np.uint64]:
         cells = np.empty(len(p_world), np.uint64)
-        _cells_of(np.ascontiguousarray(p_world), cell, self._level_of(cell), cells)
+        _cells_of(np.ascontiguousarray(p_world), cell, np.uint64(max(round(math.log2(self._largest_cell / cell)), 0)), cells)
         return cells
-
-    def _seen_again(self, cells: NDArray[np.uint64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which of these cells (n,) hold a first arrival, and which of the first arrivals lie in them."""
-        waited, again = np.zeros(len(cells), np.bool_), np.zeros(len(self._cells), np.bool_)
-        bits = (2 * len(again) + 1).bit_length()
-        _meet(cells, self._cells, np.full(1 << bits, _EMPTY), np.uint64(64 - bits), waited, again)
-        return waited, again
 
     def _keep(self, which: NDArray[np.bool_]) -> None:
         if not which.all():

@@ -24,6 +24,7 @@ from boxplus.filtering.plane_information import (
     UNCONFIRMED,
     USED,
     accumulate_parts,
+    shared_information,
 )
 from boxplus.filtering.plane_scatter import plane_scatter
 from boxplus.filtering.small_linalg import cholesky_inverse_into
@@ -36,6 +37,7 @@ from boxplus.maps.plane_matching import MANY, NEIGHBOURS, PLANE, match_planes, s
 from boxplus.maps.registration_config import RegistrationConfig
 
 _CHUNK = 1024
+_ASKED = 1000  # points of a scan, of what they rest on
 _UNTOLD = 1e-3  # of the mean information: directions that have less are hardly told
 _SAME_NEIGHBOURS = 0.05  # cells of the map a point may move and keep its neighbours
 REASONS = {
@@ -146,9 +148,10 @@ class PlaneMeasurement:
             arrivals: of the map.
             share: of the map that is new, for directions of which nothing tells.
         """
-        A, newest = arrivals.information_on_newest(
-            x, self._tree.origin, self._p_lidar, self._planes, self._fate, self._neighbours
-        )
+        asked = slice(None, None, max(self.points // _ASKED, 1))
+        rests_on = self._neighbours[asked].reshape(-1, 3) + self._tree.origin
+        is_new = arrivals.are_newest(rests_on).reshape(-1, NEIGHBOURS)
+        A, newest = shared_information(x, self._p_lidar[asked], self._planes[asked], self._fate[asked], is_new)
         scale = np.repeat([self.lever_arm**2, 1.0], 3)
         little = np.diag(_UNTOLD * max(float(np.mean(A.diagonal() / scale)), 1e-12) * scale)
         return np.asarray(np.linalg.solve(A + little, newest + share * little), dtype=np.float64)

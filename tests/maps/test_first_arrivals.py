@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from boxplus.filtering.nav_state import NavState
-from boxplus.filtering.plane_information import USED
+from boxplus.filtering.plane_information import USED, shared_information
 from boxplus.manifolds import so3
 from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
@@ -112,5 +112,7 @@ def test_information_that_rests_on_the_points_of_the_last_scan(seed: int, count:
         h = np.concatenate([np.cross(s, x.R_world_imu.T @ planes[n, :3]), planes[n, :3]])
         said = planes[n, WEIGHT] * np.outer(h, h)
         expected += np.stack([said, is_new[chosen[n]].mean() * said])
-    found = arrivals.information_on_newest(x.pack(), tree.origin, p_lidar, planes, fate, neighbours)
+    asked = slice(None, None, max(count // 1000, 1))
+    newest = arrivals.are_newest(neighbours[asked].reshape(-1, 3) + tree.origin).reshape(-1, 5)
+    found = shared_information(x.pack(), p_lidar[asked], planes[asked], fate[asked], newest)
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
