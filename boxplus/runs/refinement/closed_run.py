@@ -103,7 +103,7 @@ def _objection(found: Georeference | None, origin: EnuFrame) -> str | None:
     """Why these are not the fixes that a run with that origin rests on; None where nothing says so."""
     if found is None:
         return "a recording without fixes"
-    if found.frame is None or found.contradiction is not None:
+    if found.frame is None or found.fit is None or found.contradiction is not None:
         return f"{found.refusal or found.contradiction}"
     # The origin is the middle of the fixes: those of another receiver, or reckoned anew, have another one.
     away = np.linalg.norm(origin.to_enu([[found.frame.latitude, found.frame.longitude, found.frame.altitude]]))

@@ -273,7 +273,8 @@ class LidarInertialOdometry(Snapshots):
             after = self._x, update.B if taken else update.B_prior
             self._mounting_drift.follow((x_prior, update.B_prior), after, self._cov[MOUNTING, MOUNTING], correction)
         self._motion = mean_motion(self._x_before, self._x, frame.duration_s)
-        map_points_world = (state := NavState.unpack(self._x)).to_world(map_points)
+        state = NavState.unpack(self._x)
+        map_points_world = state.to_world(map_points)
         self._unshown.look(map_points_world, state.p_world_imu, self.config.map_cell, directions)
         if taken:
             placed, shared = (self._x, points, map_points_world), (self._datum, self._mounting_drift)
@@ -374,8 +375,7 @@ class LidarInertialOdometry(Snapshots):
         timing_s: Mapping[str, float] | None = None,
     ) -> Estimate:
         """What is said of a scan; without an outcome it is the first one, which is exact by definition."""
-        words = [*self._unshown.words(self._time_ns), *imu_words(frame, self.config.max_imu_gap)]
-        words, self._warnings = [*self._warnings, *words], []
+        warnings, self._warnings = [*self._warnings, *self._unshown.words(self._time_ns)], []
         pose = self._unshown.widened(self._datum.pose_covariance(self._x), self._time_ns)
         return Estimate(
             time_ns=frame.scan.end_ns,
@@ -392,7 +392,7 @@ class LidarInertialOdometry(Snapshots):
             residual_rms=outcome.posterior.last.residual_rms if outcome else 0.0,
             iterations=outcome.posterior.steps if outcome else 0,
             converged=outcome.posterior.converged if outcome else True,
-            warnings=tuple(words),
+            warnings=(*warnings, *imu_words(frame, self.config.max_imu_gap)),
             timing_s=dict(timing_s or {}),
             p_lidar=p_lidar,
             intensity=frame.scan.intensity,

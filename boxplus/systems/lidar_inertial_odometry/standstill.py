@@ -55,10 +55,7 @@ class Standstill:
         if self._sets_off(imu, seconds) or displacement > _MAX_DISPLACEMENT:
             self.active = False
             return np.eye(TANGENT)
-        columns = cov[:, T_V : T_V + 3]
-        noise = _ZERO_VELOCITY_SIGMA**2 * np.eye(3)
-        innovation = cov[T_V : T_V + 3, T_V : T_V + 3] + noise
-        gain = np.linalg.solve(innovation, columns.T).T
+        gain = _gain(cov)
         delta = np.zeros(TANGENT)
         delta[:] = -gain @ x[V : V + 3]
         boxplus_into(x, delta, x)
@@ -68,7 +65,7 @@ class Standstill:
         reduced = reduce @ cov @ reduce.T + _ZERO_VELOCITY_SIGMA**2 * gain @ gain.T
         known = mounting_known(cov)[0] if cov[MOUNTING, T_V].any() else cov
         left = np.eye(TANGENT)
-        left[:, T_V : T_V + 3] -= np.linalg.solve(known[T_V : T_V + 3, T_V : T_V + 3] + noise, known[T_V : T_V + 3]).T
+        left[:, T_V : T_V + 3] -= _gain(known)
         cov[:] = 0.5 * (reduced + reduced.T)
         return left
 
@@ -91,3 +88,10 @@ class Standstill:
             self._memory_s = min(self._memory_s + duration, _LONGEST_MEMORY_S)
             self._mean += (mean - self._mean) * min(duration / self._memory_s, 1.0)
         return False
+
+
+def _gain(cov: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(24, 3) by which a state of covariance (24, 24) follows its velocity, where that is known to be zero."""
+    columns = cov[:, T_V : T_V + 3]
+    innovation = columns[T_V : T_V + 3] + _ZERO_VELOCITY_SIGMA**2 * np.eye(3)
+    return np.asarray(np.linalg.solve(innovation, columns.T).T, dtype=np.float64)
