@@ -73,6 +73,9 @@ class LioConfig(LidarOdometryConfig):
     accel_noise: float | None = Field(
         None, gt=0, description="accelerometer noise [m/s²/√Hz], likewise; None is told from its samples, 0.005 to 0.05"
     )
+    gyro_scale_noise: float = Field(
+        0.005, ge=0, le=0.1, description="what turning adds to gyro_noise, for scale and axes that are off [rad/s/√Hz per rad/s]"
+    )
     gyro_bias_walk: float = Field(1e-4, gt=0, description="random walk of the gyroscope bias [rad/s²/√Hz]")
     accel_bias_walk: float = Field(1e-3, gt=0, description="random walk of the accelerometer bias [m/s³/√Hz]")
     stamp_noise: float = Field(

@@ -248,8 +248,7 @@ class LidarInertialOdometry(Snapshots):
             frame = self._see_motion(frame)
         p_lidar, passed = self._propagate(frame)
         if self._standstill is not None and self._standstill.active:
-            left = self._standstill.update(frame.imu, frame.duration_s, self._x, self._cov)
-            passed = None if passed is None else left[:FOLLOWED, :FOLLOWED] @ passed
+            passed = self._standstill.update(frame.imu, frame.duration_s, self._x, self._cov, passed)
         clock.lap("propagate and deskew")
         self._slide_map()
         clock.lap("slide map")
@@ -286,7 +285,8 @@ class LidarInertialOdometry(Snapshots):
             p_began = self.start.state.p_world_imu if self.start is not None else state.p_world_imu
             self._insert(well_placed(map_points_world, state, update.cov if taken else cov_prior, p_began))
         clock.lap("map insertion")
-        status = self._weak_spell.status(frame.scan.end_ns, posterior.last.directions, taken)
+        stands = self._standstill is not None and self._standstill.active and not len(self._unshown.axes)
+        status = self._weak_spell.status(frame.scan.end_ns, posterior.last.directions, taken, stands=stands)
         return self._estimate(frame, p_lidar, Outcome(measurement, posterior, taken, cov_prior, update.cov, status), clock.laps)
 
     def _see_motion(self, frame: Frame) -> Frame:

@@ -42,19 +42,28 @@ class Standstill:
         self._memory_s = seconds
         self._recent: list[tuple[float, NDArray[np.float64]]] = []
 
-    def update(self, imu: ImuSamples, seconds: float, x: NDArray[np.float64], cov: NDArray[np.float64]) -> NDArray[np.float64]:
+    def update(
+        self,
+        imu: ImuSamples,
+        seconds: float,
+        x: NDArray[np.float64],
+        cov: NDArray[np.float64],
+        passed: NDArray[np.float64] | None,
+    ) -> NDArray[np.float64] | None:
         """If the platform still rests, apply v = 0 to the state x (36,) and its covariance (24, 24), in place.
-
-        Returns what that leaves of the errors of the state, (24, 24), with the mounting known.
 
         Args:
             imu: the samples of a scan; seconds: how long it took [s].
             x, cov: the state predicted for its end.
+            passed: (n, n) what the prediction has made of the first n errors of the state; None where nobody knows.
+
+        Returns:
+            (n, n) what is left of them now, with the mounting known.
         """
         displacement = np.linalg.norm(x[P : P + 3] - self._p_world_imu)
         if self._sets_off(imu, seconds) or displacement > _MAX_DISPLACEMENT:
             self.active = False
-            return np.eye(TANGENT)
+            return passed
         gain = _gain(cov)
         delta = np.zeros(TANGENT)
         delta[:] = -gain @ x[V : V + 3]
@@ -67,7 +76,7 @@ class Standstill:
         left = np.eye(TANGENT)
         left[:, T_V : T_V + 3] -= _gain(known)
         cov[:] = 0.5 * (reduced + reduced.T)
-        return left
+        return None if passed is None else left[: len(passed), : len(passed)] @ passed
 
     def _sets_off(self, imu: ImuSamples, seconds: float) -> bool:
         """Whether the turns and changes of velocity of the last scans are more than noise, over any of the lengths."""

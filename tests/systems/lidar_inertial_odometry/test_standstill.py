@@ -30,7 +30,7 @@ def _leaves_after(acceleration: float, density: float, seed: int, seconds: float
         now = acceleration * min(0.1 * k, 1.0)
         speed += 0.1 * now
         x, cov = NavState.identity().pack(), 1e-4 * np.eye(TANGENT)
-        still.update(_samples(1.0 + 0.1 * k, 0.1, density, rng, now), 0.1, x, cov)
+        still.update(_samples(1.0 + 0.1 * k, 0.1, density, rng, now), 0.1, x, cov, None)
         if not still.active:
             return 0.1 * (k + 1), speed
     return np.inf, speed
@@ -60,7 +60,7 @@ def test_a_bias_that_walks_does_not_end_it(seed: int) -> None:
     still = Standstill(_samples(0.0, 1.0, 4e-3, rng), np.zeros(3))
     bias = np.cumsum(2e-3 * np.sqrt(0.1) * rng.normal(size=1200))  # a cheap IMU, two minutes
     for k, now in enumerate(bias):
-        still.update(_samples(1.0 + 0.1 * k, 0.1, 4e-3, rng, now), 0.1, NavState.identity().pack(), np.eye(TANGENT))
+        still.update(_samples(1.0 + 0.1 * k, 0.1, 4e-3, rng, now), 0.1, NavState.identity().pack(), np.eye(TANGENT), None)
     assert still.active
 
 
@@ -70,7 +70,7 @@ def test_a_displacement_ends_it_for_good() -> None:
     for k, shift in enumerate((0.04, 0.06, 0.0)):
         x = NavState.identity().pack()
         x[P] = shift
-        still.update(_samples(1.0 + 0.1 * k, 0.1, 2e-3, rng), 0.1, x, np.eye(TANGENT))
+        still.update(_samples(1.0 + 0.1 * k, 0.1, 2e-3, rng), 0.1, x, np.eye(TANGENT), None)
         assert still.active == (k == 0)
 
 
@@ -80,7 +80,7 @@ def test_while_it_rests_the_velocity_is_zero_and_known() -> None:
     x, cov = NavState.identity().pack(), np.eye(TANGENT)
     cov[T_V : T_V + 3, 3:6] = cov[3:6, T_V : T_V + 3] = 0.5 * np.eye(3)
     x[V : V + 3], x[P : P + 3] = (0.1, -0.2, 0.0), (0.02, 0.0, 0.0)
-    still.update(_samples(1.0, 0.1, 2e-3, rng), 0.1, x, cov)
+    still.update(_samples(1.0, 0.1, 2e-3, rng), 0.1, x, cov, None)
     np.testing.assert_allclose(x[V : V + 3], 0.0, atol=1e-4)
     np.testing.assert_allclose(x[P : P + 3], [0.02 - 0.05, 0.1, 0.0], atol=1e-4)  # what goes with the velocity
     assert np.all(np.sqrt(np.diag(cov)[T_V : T_V + 3]) < 0.0101)
@@ -94,11 +94,17 @@ def test_it_says_what_it_has_left_of_the_errors(rests: bool) -> None:
     still = Standstill(_samples(0.0, 1.0, 2e-3, rng), np.zeros(3))
     root, x = rng.normal(size=(TANGENT, TANGENT)), NavState.identity().pack()
     cov = 1e-4 * root @ root.T
-    before = cov.copy()
-    left = still.update(_samples(1.0, 0.1, 2e-3, rng, 0.0 if rests else 5.0), 0.1, x, cov)
+    before, whole = cov.copy(), np.eye(TANGENT)
+    left = still.update(_samples(1.0, 0.1, 2e-3, rng, 0.0 if rests else 5.0), 0.1, x, cov, whole)
+    assert left is not None and (left == whole).all() == (not rests)
     np.testing.assert_allclose(left[:18, :18] @ mounting_known(before)[0][:18, :18], mounting_known(cov)[0][:18, :18], atol=1e-9)
     before[18:, :18] = before[:18, 18:] = 0.0
-    cov = before.copy()
-    again = still.update(_samples(1.1, 0.1, 2e-3, rng, 0.0 if rests else 5.0), 0.1, x, cov) if rests else left
-    np.testing.assert_allclose(again @ before, cov if rests else before, atol=1e-9)
-    assert (left == np.eye(TANGENT)).all() == (not rests)
+    for passed in (whole, 2.0 * whole[:18, :18], None):
+        now = before.copy()
+        again = still.update(_samples(1.1, 0.1, 2e-3, rng, 0.0 if rests else 5.0), 0.1, x, now, passed)
+        if passed is None:
+            assert again is None
+        else:
+            n = len(passed)
+            kept = again @ before[:n, :n] / passed[0, 0]
+            np.testing.assert_allclose(kept, now[:n, :n] if rests else before[:n, :n], atol=1e-9)

@@ -10,13 +10,15 @@ has come up in between, but for
                      with what an uncertain mounting adds to it (`mounting_drift`)
 
 What it says beyond C is given to the covariance of pose and map (the positive part of δδᵀ − C), and is told where it is beyond
-four standard deviations. Directions of the new scan that the old ones do not determine stay where the estimate has them.
+four standard deviations and has come to 3 cm or 0.3 deg, at once or bit by bit: less is in the covariance. Directions of the new
+scan that the old ones do not determine stay where the estimate has them.
 
 Source: docs/lidar_inertial_odometry.md, section 10.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -33,6 +35,7 @@ from boxplus.systems.lidar_inertial_odometry.mounting.mounting_drift import Moun
 _BASELINE_NS = 1_250_000_000
 _MAP_SCANS = 5
 _TOLD = 4.0  # standard deviations of position or rotation: √(δᵀ C⁻¹ δ)
+_MINDED_M, _MINDED_RAD = 0.03, math.radians(0.3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +45,7 @@ class Drift:
     Attributes:
         excess: (6, 6) covariance beyond what was stated: [θ about the IMU's axes, p along the world's].
         deviations: how far the newest scan lies from where the old ones want it, in standard deviations.
-        warnings: a sentence where that is beyond four.
+        warnings: a sentence where that is beyond four, and enough to mind.
     """
 
     excess: NDArray[np.float64]
@@ -68,6 +71,7 @@ class LongBaseline:
         self._laid = 0  # of the old scans, that are in the map of them
         self._map: IkdTree | None = None
         self._old_ns = 0
+        self._untold = np.zeros(6)  # sum of what was beyond four standard deviations, since it was told last
 
     def follow(
         self,
@@ -126,7 +130,7 @@ class LongBaseline:
         C = registration + between
         deviations = deviations_of(delta, C)
         warnings = []
-        if deviations > _TOLD:
+        if deviations > _TOLD and self._comes_to_much(delta):
             warnings.append(
                 f"scans {seconds:.3g} s apart do not fit each other as they were placed: by "
                 f"{np.linalg.norm(delta[3:]) * 100:.1f} cm and {np.degrees(np.linalg.norm(delta[:3])):.2f} deg, "
@@ -134,3 +138,11 @@ class LongBaseline:
                 f"({self._causes}); covariance widened"
             )
         return Drift(positive_part(np.outer(delta, delta) - C), deviations, warnings)
+
+    def _comes_to_much(self, delta: NDArray[np.float64]) -> bool:
+        """Whether a drift (6,), with what went untold before it, is enough to mind."""
+        self._untold += delta
+        much = bool(np.linalg.norm(self._untold[:3]) > _MINDED_RAD or np.linalg.norm(self._untold[3:]) > _MINDED_M)
+        if much:
+            self._untold[:] = 0.0
+        return much

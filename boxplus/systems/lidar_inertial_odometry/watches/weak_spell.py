@@ -24,19 +24,25 @@ class WeakSpell:
         self._known_ns = known_ns
         self._scans: deque[tuple[int, bool]] = deque()
 
-    def status(self, time_ns: int, directions: PoseDirections, taken: bool) -> Status:
+    def status(self, time_ns: int, directions: PoseDirections, taken: bool, *, stands: bool = False) -> Status:
         """Of the scan that ends at `time_ns` [ns]: weak where half of the scans of the last half second left a direction open.
 
         The part of that half second before a pose that was known counts as seen, and a scan that measures every direction
-        clearly is not weak itself, though it may be the first after many that were.
+        clearly is not weak itself, though it may be the first after many that were. While the platform is known to stand, its
+        pose is known whatever a scan leaves open: rings that meet the same spots again and again say nothing new.
 
         Args:
             time_ns: end of the scan.
             directions: what it determines.
             taken: whether it was taken in.
+            stands: whether the platform stands, as the surroundings have shown.
         """
         if not taken:
             return "lost"
+        if stands:
+            self._known_ns = time_ns
+            self._scans.clear()
+            return "ok"
         self._scans.append((time_ns, bool(directions.weak.any())))
         while self._scans[0][0] < time_ns - _WINDOW_NS:
             self._scans.popleft()

@@ -18,15 +18,20 @@ PERIOD_NS = 100_000_000
 THRESHOLD = 1.3
 
 
-def statuses(is_open: list[bool], period_ns: int = PERIOD_NS, known_ns: int | None = None, shown: float = 1.5) -> list[str]:
-    """What a spell says scan by scan, the first one at 0; `shown` is the ratio of the weakest direction where none is open."""
+def statuses(
+    is_open: list[bool], period_ns: int = PERIOD_NS, known_ns: int | None = None, shown: float = 1.5, standing: int = 0
+) -> list[str]:
+    """What a spell says scan by scan, the first one at 0; `shown` is the ratio of the weakest direction where none is open, and
+    during the first `standing` scans the platform stands."""
     spell = WeakSpell(THRESHOLD, known_ns)
 
     def directions(weak: bool) -> Any:
         ratios = np.array([9.0] * 5 + [1.0 if weak else shown])
         return SimpleNamespace(weak=ratios < THRESHOLD, ratios=ratios)
 
-    return [spell.status(number * period_ns, directions(weak), True) for number, weak in enumerate(is_open)]
+    return [
+        spell.status(number * period_ns, directions(weak), True, stands=number < standing) for number, weak in enumerate(is_open)
+    ]
 
 
 def test_single_scans_are_passed_over() -> None:
@@ -72,5 +77,12 @@ def test_the_time_before_a_known_pose_counts_as_seen(period_ns: int) -> None:
     assert known[window:] == statuses(begins_open, period_ns)[window:]
 
 
-def test_without_an_update_the_scan_is_lost() -> None:
-    assert WeakSpell(THRESHOLD).status(0, None, False) == "lost"  # type: ignore[arg-type]
+@given(st.lists(st.booleans(), min_size=1, max_size=60), st.integers(1, 60))
+def test_a_platform_that_stands_is_where_it_is_and_moves_off_from_a_known_pose(is_open: list[bool], standing: int) -> None:
+    found = statuses([True] * standing + is_open, standing=standing)
+    assert found == ["ok"] * standing + statuses(is_open, known_ns=-PERIOD_NS)
+
+
+def test_without_an_update_the_scan_is_lost_standing_or_not() -> None:
+    for stands in (False, True):
+        assert WeakSpell(THRESHOLD).status(0, None, False, stands=stands) == "lost"  # type: ignore[arg-type]
