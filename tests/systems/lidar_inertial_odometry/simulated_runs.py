@@ -62,15 +62,17 @@ def run(
     lidar: SpinningLidar | None = None,
     imu: ImuModel | None = None,
     seed: int = 0,
+    calibrated: bool = False,
 ) -> Run:
-    """Push a simulation through the odometry, sample block by scan, as a driver would.
+    """Push a simulation through the odometry, sample block by scan, as a driver would; `calibrated`: told that the gyroscope is.
 
     Raises:
         InputError: what the odometry raises.
     """
     simulation = simulate(scenario, seed, duration_s=duration_s, lidar=lidar, imu=imu)
     T_imu_lidar = simulation.T_imu_lidar if fault is None else fault.declared_extrinsic(simulation.T_imu_lidar)
-    odometry = LidarInertialOdometry(LioConfig(T_imu_lidar=T_imu_lidar.tolist()))
+    config = LioConfig(T_imu_lidar=T_imu_lidar.tolist())
+    odometry = LidarInertialOdometry(config.model_copy(update={"gyro_scale_noise": 0.0}) if calibrated else config)
     estimates: list[Estimate] = []
     for event in simulation.events() if fault is None else fault.events(simulation.events()):
         estimates += odometry.push_scan(event) if isinstance(event, Scan) else odometry.push_imu(event)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from boxplus.simulation import RosetteLidar, Scenario, SpinningLidar
+from boxplus.sensors.inertial.imu import ImuSamples
+from boxplus.simulation import Fault, RosetteLidar, Scenario, SpinningLidar
+from boxplus.simulation.faults import Event
 from boxplus.simulation.imu import ImuModel
 from boxplus.simulation.motions import manoeuvres, trajectories
 from boxplus.simulation.worlds import sites
@@ -22,7 +27,7 @@ from tests.systems.lidar_inertial_odometry.simulated_runs import run
     pytest.param("moving_start", 8.0, 0.05, 0.1, id="recording that begins at 11 m/s"),
 ])  # fmt: skip
 def test_stress_run(scenario: str, duration_s: float | None, metres: float, degrees: float) -> None:
-    stress = run(scenario, duration_s)
+    stress = run(scenario, duration_s, calibrated=scenario == "stress_flips")  # the simulated one is, and the LiDAR knows less
     assert len(stress.estimates) == stress.simulation.scan_count, "no scan is left out, those of the start included"
     assert "lost" not in stress.status
     assert not stress.odometry.counters
@@ -31,6 +36,23 @@ def test_stress_run(scenario: str, duration_s: float | None, metres: float, degr
     assert len(undecided) == (scenario == "stress_drone")
     assert stress.warnings == undecided
     assert stress.distance.max() < metres
+    assert stress.rotation_error_deg.max() < degrees
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scale", "degrees"), [((1.005, 0.995, 1.004), 0.65), ((1.002, 1.002, 0.998), 0.5), ((1.0, 1.0, 1.0), 0.4)]
+)
+def test_flips_with_a_gyroscope_as_it_comes_from_the_factory(scale: tuple[float, float, float], degrees: float) -> None:
+    """Half a percent of 1000 deg/s is 5 deg/s: believed as one that moves smoothly, it was off by 1.7 deg, and told to drift."""
+
+    def read(events: Iterable[Event]) -> Iterator[Event]:
+        for event in events:
+            yield replace(event, gyro=event.gyro * scale) if isinstance(event, ImuSamples) else event
+
+    stress = run("stress_flips", fault=Fault("gyro_scale", "the gyroscope's axes read too much or too little", read))
+    assert not stress.warnings and set(stress.status) == {"ok"}
+    assert stress.distance.max() < 0.06
     assert stress.rotation_error_deg.max() < degrees
 
 
