@@ -10,7 +10,7 @@ has come up in between, but for
                      with what an uncertain mounting adds to it (`mounting_drift`)
 
 What it says beyond C is given to the covariance of pose and map (the positive part of δδᵀ − C), and is told where it is beyond
-four standard deviations and has come to 3 cm or 0.3 deg, at once or bit by bit: less is in the covariance. Directions of the new
+four standard deviations and has come to 5 cm or 0.3 deg, at once or bit by bit: less is in the covariance. Directions of the new
 scan that the old ones do not determine stay where the estimate has them.
 
 Source: docs/lidar_inertial_odometry.md, section 10.
@@ -35,7 +35,7 @@ from boxplus.systems.lidar_inertial_odometry.mounting.mounting_drift import Moun
 _BASELINE_NS = 1_250_000_000
 _MAP_SCANS = 5
 _TOLD = 4.0  # standard deviations of position or rotation: √(δᵀ C⁻¹ δ)
-_MINDED_M, _MINDED_RAD = 0.03, math.radians(0.3)
+_MINDED_M, _MINDED_RAD = 0.05, math.radians(0.3)
 
 
 @dataclass(frozen=True, slots=True)
