@@ -36,6 +36,7 @@ from boxplus.systems.lidar_inertial_agreement.planes.ground_lean import GroundLe
 from boxplus.systems.lidar_inertial_agreement.planes.plane_tilt import PlaneTilt, plane_tilt
 from boxplus.systems.lidar_inertial_agreement.planes.surroundings import surroundings_of
 from boxplus.systems.lidar_inertial_agreement.rotation import SCALE, RotationFit, compare_rotations
+from boxplus.systems.lidar_inertial_agreement.steady_turn import SteadyTurn, steady_turn
 from boxplus.systems.lidar_inertial_agreement.translation import SLOPE, TranslationFit, compare_accelerations, wide_prior
 
 _EXPLAINED = 0.8  # of the LiDAR's rotation, before the gyroscope may help to undistort
@@ -73,6 +74,7 @@ class Agreement:
         imu_rate_hz: of the samples.
         gyro_power: mean square of the gyroscope's rates, averaged as between two scans, about their mean [(rad/s)²], in its own
             unit.
+        steady: mean turns of both; None where the scans do not show the LiDAR's.
         planes: how upright the surroundings are under the declared mounting; None where none was declared, or nothing shows it.
         ground: how far the ground leans that the LiDAR was driven along, likewise.
         in_feet: the accelerations again with the points taken for feet; None where they are not as thick as feet would be.
@@ -86,6 +88,7 @@ class Agreement:
     R_imu_lidar: NDArray[np.float64]
     imu_rate_hz: float
     gyro_power: float
+    steady: SteadyTurn | None = None
     planes: PlaneTilt | None = None
     ground: GroundLean | None = None
     in_feet: TranslationFit | None = None
@@ -235,7 +238,7 @@ def _compared(
         if translation is not None:
             unknown = translation.slope * _between(imu.accel)
             translation = replace(translation, covariance=_widened(translation.covariance, SLOPE, unknown))
-    return Agreement(path, rotation, translation, R, rate_hz, _power(imu))
+    return Agreement(path, rotation, translation, R, rate_hz, _power(imu), steady_turn(path, imu))
 
 
 def _between(samples: NDArray[np.float64]) -> float:

@@ -69,6 +69,7 @@ def contradictions(agreement: Agreement, T_declared: NDArray[np.float64] | None)
     found = (
         _of_unit(rotation)
         or _of_sign(rotation)
+        or _of_steady_turn(agreement, rotation, T_declared)
         or _of_belonging(agreement, rotation)
         or _of_mirror(rotation, translation, T_declared)
         or (None if agreement.corrected is None else agreement.corrected.finding)
@@ -195,6 +196,13 @@ def _of_sign(rotation: RotationFit) -> Finding | None:
         f"gyroscope and LiDAR turn in opposite senses (mirrored they agree to {rotation.mirrored:.0%}, as they come to "
         f"{rotation.explained:.0%}): the gyroscope's sign is flipped, or one of its axes; negate its rates",
     )
+
+
+def _of_steady_turn(agreement: Agreement, rotation: RotationFit, T_declared: NDArray[np.float64] | None) -> Finding | None:
+    """Unit and sign by the means of both turns, where they do not change enough to show them."""
+    if agreement.steady is None or shows_turns(rotation):
+        return None
+    return agreement.steady.finding(None if T_declared is None else T_declared[:3, :3])
 
 
 def _of_belonging(agreement: Agreement, rotation: RotationFit) -> Finding | None:
