@@ -26,7 +26,7 @@ from boxplus.filtering.plane_information import (
     accumulate_parts,
     shared_information,
 )
-from boxplus.filtering.plane_scatter import plane_scatter
+from boxplus.filtering.pose_covariance.plane_scatter import plane_scatter
 from boxplus.filtering.small_linalg import cholesky_inverse_into
 from boxplus.maps.curved_patches import FILLED_CELLS, MEAN_LEVERAGE, ONE_WAY, PATCH, SPARSE_CELLS, bend_planes
 from boxplus.maps.first_arrivals import FirstArrivals

@@ -71,7 +71,7 @@ class Estimate:
             perturbed on the right (IMU frame) [rad], position and velocity along the world's axes. It is the filter's, which
             takes the map for exact: the pose is meant relative to the map around it.
         pose_covariance: (6, 6) float64 of the pose `[θ, p]`, order and axes as above, relative to the first pose: with what the
-            map has taken over from the errors of earlier poses. It grows with the way (see `filtering.map_datum`).
+            map has taken over from the errors of earlier poses. It grows with the way (see `filtering.pose_covariance`).
         status: "ok"; "weak": over half a second most scans left a direction open, which was predicted only; "lost": no update was
             possible, or too few points fit the map, scan after scan.
         weak_directions: the directions the scan did not determine.

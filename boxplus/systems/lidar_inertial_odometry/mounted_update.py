@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.correction import Correction
 from boxplus.filtering.iterated_update import Measurement, Posterior, iterated_update
-from boxplus.filtering.map_datum import SHARED_ERRORS
 from boxplus.filtering.nav_state import RL
+from boxplus.filtering.pose_covariance.correction import Correction
+from boxplus.filtering.pose_covariance.map_datum import SHARED_ERRORS
 from boxplus.filtering.uncertain_instant import UncertainInstant
 from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.plane_measurement import PlaneMeasurement

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from boxplus._arguments import as_settings
 from boxplus._stopwatch import Stopwatch
-from boxplus.filtering.map_datum import SHARED_ERRORS, MapDatum
 from boxplus.filtering.nav_state import TANGENT, G, NavState, P, V
+from boxplus.filtering.pose_covariance.map_datum import SHARED_ERRORS, MapDatum
 from boxplus.filtering.propagation import FOLLOWED, NODE, propagate_interval, transition
 from boxplus.filtering.uncertain_instant import UncertainInstant
 from boxplus.maps.first_arrivals import FirstArrivals

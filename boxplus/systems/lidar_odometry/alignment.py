@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.correction import Correction
 from boxplus.filtering.degeneracy import strong_covariance
 from boxplus.filtering.iterated_update import Information
+from boxplus.filtering.pose_covariance.correction import Correction
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.plane_measurement import PlaneMeasurement
 from boxplus.maps.registration_config import RegistrationConfig

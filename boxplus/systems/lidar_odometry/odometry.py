@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from boxplus._arguments import as_settings
 from boxplus._stopwatch import Stopwatch
-from boxplus.filtering.map_datum import SHARED_ERRORS, MapDatum
 from boxplus.filtering.nav_state import T_V, TANGENT
+from boxplus.filtering.pose_covariance.map_datum import SHARED_ERRORS, MapDatum
 from boxplus.maps.first_arrivals import FirstArrivals
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.sliding_box import SlidingBox

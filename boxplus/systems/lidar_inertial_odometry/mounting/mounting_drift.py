@@ -18,8 +18,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.correction import Correction
 from boxplus.filtering.nav_state import P, R
+from boxplus.filtering.pose_covariance.correction import Correction
 from boxplus.manifolds import so3
 from boxplus.systems.lidar_inertial_odometry.mounting.unknown_mounting import first_sensitivity
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.map_datum import MapDatum
+from boxplus.filtering.pose_covariance.map_datum import MapDatum
 from boxplus.filtering.small_linalg import positive_part
 from boxplus.maps.ikd_tree import IkdTree
 from boxplus.maps.registration_config import RegistrationConfig

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from boxplus.filtering.correction import Correction
-from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState
+from boxplus.filtering.pose_covariance.correction import Correction
+from boxplus.filtering.pose_covariance.map_datum import MapDatum
 from boxplus.manifolds import so3
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig
 from boxplus.systems.lidar_inertial_odometry.mounting.mounting_drift import MountingDrift

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from boxplus.filtering.degeneracy import PoseDirections
 from boxplus.filtering.iterated_update import Information, iterated_update
-from boxplus.filtering.map_datum import SHARED_ERRORS
 from boxplus.filtering.nav_state import PL, RL, TANGENT, G, NavState, P, R
+from boxplus.filtering.pose_covariance.map_datum import SHARED_ERRORS
 from boxplus.manifolds import so3
 from boxplus.sensors.lidar.scan import Scan
 from boxplus.simulation import ImuModel, Scenario, Simulation, SpinningLidar, mounting

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import TANGENT, NavState
+from boxplus.filtering.pose_covariance.map_datum import MapDatum
 from boxplus.manifolds import so3
 from boxplus.runs.storage.state_codec import read_state, write_state
 from boxplus.systems.lidar_inertial_odometry.config import LioConfig

@@ -9,9 +9,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from boxplus.filtering.correction import Correction
-from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import NavState
+from boxplus.filtering.pose_covariance.correction import Correction
+from boxplus.filtering.pose_covariance.map_datum import MapDatum
 from boxplus.manifolds import so3
 
 STATE, MAP, THIRD, ALL = slice(0, 18), slice(18, 24), slice(24, 30), 30

@@ -44,9 +44,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from boxplus.filtering.correction import Correction
-from boxplus.filtering.joint_errors import correct, lay_down, move_map, predict, renew, turn_into
 from boxplus.filtering.nav_state import T_G, T_V, G, P, R, V
+from boxplus.filtering.pose_covariance.correction import Correction
+from boxplus.filtering.pose_covariance.joint_errors import correct, lay_down, move_map, predict, renew, turn_into
 from boxplus.filtering.small_linalg import positive_part
 from boxplus.manifolds import so3
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from boxplus.filtering.correction import Correction
 from boxplus.filtering.degeneracy import pose_directions
-from boxplus.filtering.map_datum import MapDatum
 from boxplus.filtering.nav_state import MEASURED, NavState
+from boxplus.filtering.pose_covariance.correction import Correction
+from boxplus.filtering.pose_covariance.map_datum import MapDatum
 from boxplus.manifolds import so3
 
 seeds = st.integers(0, 2**32 - 1)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from boxplus.filtering.nav_state import NavState
 from boxplus.filtering.plane_information import GATED, USED
-from boxplus.filtering.plane_scatter import LEAST, plane_scatter
+from boxplus.filtering.pose_covariance.plane_scatter import LEAST, plane_scatter
 from boxplus.maps.plane_matching import PLANE
 from tests.filtering.random_states import random_state
 
