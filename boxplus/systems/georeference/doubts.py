@@ -23,6 +23,9 @@ _SIGMAS = 3.0
 _LEAST_DELAY = 0.03
 _ADDED = 0.85  # of the standard deviation that a delay had before, below which fixes have added something to it
 NOISY = 1.5
+_APART = 1.0  # [s] of two clocks, that fixes show at three standard deviations or not at all
+_ONE_CLOCK = 0.01  # [s] beforehand: somebody has said that they are not
+_FAST = 0.3  # [m/s] of a steady way, below which that moves a map by less than fixes are known to
 _BENT = 4.0  # mean square of the odometry's errors, where 1 is what its covariance allows
 
 
@@ -93,6 +96,13 @@ def doubts_of(
             f"correct the stamps, or set gnss.time_offset_s={config.time_offset_s - delay:.2f}"
             f"{_or_lever(attached, found, delay, sigma)}"
         )
+    speed = steady_speed(attached, found, config)
+    if speed > _FAST:
+        warnings.append(
+            "the way is too straight and too steady to tell whether the clocks of receiver and odometry are apart: each second "
+            f"of it moves the map by {speed:.1f} m along the way, and {config.delay_sigma:.2g} s are allowed for; where they are "
+            f"one, set gnss.delay_sigma={_ONE_CLOCK}"
+        )
     share = 1.0 - float(found.is_used.mean())
     if share > _MANY_GATED:
         warnings.append(f"{100 * share:.0f} % of the fixes contradict the others and are not used")
@@ -139,6 +149,19 @@ def _where_heights_jump(attached: AttachedFixes, found: Fit) -> str:
         f"; they jump by {metres:+.1f} m at {seconds[at]:.0f} s: another reference of heights from there on (the sea in place of "
         "the ellipsoid), or another base station"
     )
+
+
+def steady_speed(attached: AttachedFixes, found: Fit, config: GeoreferenceConfig) -> float:
+    """By how much a second of a clock that is apart moves the map unseen [m]; zero where the fixes show it, or may.
+
+    A delay τ moves fixes by v τ, of which the mean over the way is a shift of the map, and only the rest can be seen.
+    """
+    of_fixes = 1.0 / found.delay_sigma**2 - 1.0 / config.delay_sigma**2
+    if of_fixes * _APART**2 > _SIGMAS**2 or config.delay_sigma <= _ONE_CLOCK:
+        return 0.0
+    seconds = float(attached.time_ns[-1] - attached.time_ns[0]) * 1e-9
+    p_enu = attached.frame.to_enu(attached.lat_lon_alt[[0, -1]])
+    return float(np.linalg.norm(p_enu[1, :2] - p_enu[0, :2])) / max(seconds, 1e-9)
 
 
 def told_delay(delay: float, sigma: float, before: float) -> tuple[float, float]:

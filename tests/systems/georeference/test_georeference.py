@@ -389,12 +389,24 @@ def northward(length: float) -> Drive:
 
 
 def test_a_straight_way_tells_the_heading_but_not_always_the_order_of_the_numbers() -> None:
-    assert found(northward(250.0), GOOD).warnings == []  # swapped, the way would be 1 % shorter
+    known = GeoreferenceConfig(delay_sigma=0.01)
+    assert found(northward(250.0), GOOD, known).warnings == []  # swapped, the way would be 1 % shorter
     north = northward(150.0)
     result = found(north, GOOD.model_copy(update={"sigma": 1.5, "claimed": 1.5}))
     assert result.refusal is None and result.fit is not None
     assert any("swapped" in text for text in result.warnings)
     assert north.off(result).max() < 4.0 * np.sqrt(2.0) * result.fit.sigma.max()
+
+
+@pytest.mark.parametrize("delay", [0.0, 1.0, -2.0])
+def test_a_straight_and_steady_way_does_not_tell_the_clocks_apart_and_says_so(delay: float) -> None:
+    straight = northward(250.0)
+    result = found(straight, GOOD.model_copy(update={"delay_s": delay}))
+    (warning,) = result.warnings
+    told = re.search(r"each second of it moves the map by ([\d.]+) m", warning)
+    assert told is not None and result.fit is not None
+    off = float(np.median(straight.off(result)))
+    assert abs(off - float(told[1]) * abs(delay)) < 3.0 * np.sqrt(2.0) * result.fit.sigma.max()
 
 
 def test_standing_still_tells_no_heading() -> None:
