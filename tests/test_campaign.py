@@ -279,7 +279,8 @@ def test_the_simulator_tells_a_smooth_tunnel_from_a_room(campaign: SimpleNamespa
 def test_a_field_in_which_nothing_shows_the_rotation_at_rest_turns_nothing_as_it_moves(campaign: SimpleNamespace) -> None:
     """Planes through rings of scans that a quarter of a degree had put at other heights lifted it by 44 cm, 7 sigma."""
     line = campaign.run.run_seed(80784)
-    assert (line["world"], line["motion"], line["status"]["weak"] > 20) == ("open_field", "vibration", True)
+    # It stands: scans that leave directions open are not weak for it.
+    assert (line["world"], line["motion"], set(line["status"])) == ("open_field", "vibration", {"ok"})
     assert line["verdict"] == "right" and line["worst_m"] < 0.05 and line["worst_sigmas"] < 3.0
 
 
