@@ -61,7 +61,10 @@ class SteadyTurn:
             text = f"{how_fast}: its rates were taken for deg/s and are rad/s (reading a recording: --gyro-unit rad/s)"
             return Finding("gyro_unit", text)
         if R_imu_lidar is not None and self._means(-1.0, R_imu_lidar):
-            text = f"{how_fast}, the other way round: its sign is flipped (negate its rates), or T_imu_lidar is half a turn off"
+            text = (
+                f"{how_fast}, the other way round: its sign is flipped (negate its rates), T_imu_lidar is half a turn off, or "
+                "the points are mirrored"
+            )
             return Finding("gyro_sign", text)
         return None
 
